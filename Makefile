@@ -113,8 +113,8 @@ performance-check: dependencies
 	    $(if $(BASE),--parent '$(BASE)')
 
 #: make benchmark, make performance
-#:              measure everything (hours), or node, start-up, solvers and logs
-#:              (an hour), and write docs/measured/
+#:              measure everything (hours), or node, start-up and logs (an hour),
+#:              and write docs/measured/
 benchmark performance:
 	@$(MAKE) --no-print-directory VENV=.venv-benchmark dependencies
 	@benchmark/all .venv-benchmark $@

@@ -3,11 +3,11 @@
 """
 A node that only publishes constant bytes, for `node_cpu.py` and `startup.py`.
 
-An rclpy timer, or a thread that sleeps until absolute deadlines, publishes the same bytes at each
-tick.  Nothing is computed.  On request the node has the parameters (a JSON file of name, value,
-description and range), the services and the subscription of `sim_node`.
+A thread that sleeps until absolute deadlines publishes the same bytes at each tick.  Nothing is
+computed.  On request the node has the parameters (a JSON file of name, value, description and
+range), the services and the subscription of `sim_node`.
 
-    python benchmark/bare_node.py --ros-args -p rate:=1000.0 -p pacing:=thread
+    python benchmark/bare_node.py --ros-args -p rate:=1000.0
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from pathlib import Path
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
@@ -34,7 +33,6 @@ class Bare(Node):
     def __init__(self) -> None:
         super().__init__('spinning_top')
         rate = self.declare_parameter('rate', 100.0).value
-        pacing = self.declare_parameter('pacing', 'timer').value
         like = self.declare_parameter('like', '').value
         self.once = self.declare_parameter('once', False).value
         self.sinks = []
@@ -46,12 +44,8 @@ class Bare(Node):
                              position=3 * [0.0], velocity=3 * [0.0]))
         self._add(Imu, 'imu/data_raw', Imu())
         self.rate, self.stopped = rate, False
-        if pacing == 'thread':
-            self.thread = threading.Thread(target=self._run, daemon=True)
-            self.thread.start()
-        else:
-            self.create_timer(1.0 / rate, self._publish,
-                              clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
 
     def _add(self, kind, topic, message) -> None:
         message.header.frame_id = 'imu_link'
@@ -116,8 +110,7 @@ def main() -> None:
             raise
     finally:
         node.stopped = True
-        if hasattr(node, 'thread'):
-            node.thread.join(1.0)
+        node.thread.join(1.0)
         node.destroy_node()
         rclpy.try_shutdown()
 

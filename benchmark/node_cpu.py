@@ -10,7 +10,7 @@ Each node publishes pose, joint_states and imu/data_raw at one rate to 1 and to 
 `sim_node` runs with its default of 200 ticks per second and with one tick per sample.  It is
 compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects), under the
 executor of `rclpy.spin` and under rclpy's EventsExecutor, and with `bare_node.py`, the floor:
-constant bytes, one tick per sample, by a thread or by a timer.  With a pivot that goes to and fro,
+constant bytes, one tick per sample, by a thread.  With a pivot that goes to and fro,
 and beside it with one at rest, it publishes all default streams at their rates and records them.
 All take turns in every round; nodes of a pair run at once.  The tables have medians of rounds, and
 of ratios within a round.  Processor time is that of the whole process, relative to the elapsed
@@ -51,11 +51,11 @@ OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
 SIM, SIM_RECORDING = 'sim_node', 'sim_node, recording'
 TICKS_RECORDING = 'sim_node, 200 ticks, recording'
 STRAIGHT, EVENTS = 'straightforward', 'straightforward, EventsExecutor'
-FLOOR, TIMER = 'floor, thread', 'floor, timer'
+FLOOR = 'floor'
 KINDS = (TICKS_RECORDING, 'sim_node, 200 ticks', SIM_RECORDING, SIM, STRAIGHT, EVENTS, FLOOR)
 SHUTTLE = {name: value for name, value in read_scene(ROOT / 'config/shuttle.yaml').items()
            if name.startswith('pivot.')}
-PAIRS = ((TICKS_RECORDING, EVENTS), (SIM_RECORDING, FLOOR), (SIM, FLOOR), (FLOOR, TIMER))
+PAIRS = ((TICKS_RECORDING, EVENTS), (SIM_RECORDING, FLOOR), (SIM, FLOOR))
 
 
 @dataclass
@@ -75,9 +75,8 @@ def program(kind: str, rate: float, namespace: str, folder: Path) -> list[str]:
         executor = 'events' if kind == EVENTS else 'single'
         return [*script('straightforward_node.py'),
                 *ros_arguments(namespace, {'rate': float(rate), 'executor': executor})]
-    if kind in (FLOOR, TIMER):
-        return [*script('bare_node.py'), *ros_arguments(
-            namespace, {'rate': float(rate), 'pacing': kind.removeprefix('floor, ')})]
+    if kind == FLOOR:
+        return [*script('bare_node.py'), *ros_arguments(namespace, {'rate': float(rate)})]
     return sim_node(namespace, {
         'status_period': 0.0, **({} if '200 ticks' in kind else {'tick_rate': float(rate)}),
         'record.enabled': 'recording' in kind, 'record.uri': f'{folder}/',

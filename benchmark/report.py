@@ -67,7 +67,7 @@ def save(figure: Any, name: str) -> None:
 
 
 # Sections of performance.md in their order; each benchmark writes one of them.
-SECTIONS = 'node_cpu', 'startup', 'solvers', 'offline', 'soak'
+SECTIONS = 'node_cpu', 'startup', 'offline', 'soak'
 
 
 def write_section(name: str, head: str, description: str, *texts: str) -> None:

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """
-Print a line for each message on a topic: its stamp, its numbers, and the rate of the last ones.
+Print a line for each message on a topic: its stamp, its fields, and the rate of the last ones.
 
     python examples/listen.py pose
     python examples/listen.py imu/data_raw --count 10
@@ -22,17 +22,18 @@ from rclpy.qos import qos_profile_sensor_data
 MOST_NUMBERS = 12       # of a line; covariances and long arrays are left out
 
 
-def numbers(message):
-    """Yield name=value for the numbers in a message, without its header."""
+def numbers(message, within=''):
+    """Yield FIELD=VALUE for the numbers in a message, without its header."""
     for name in message.get_fields_and_field_types():
-        value = getattr(message, name)
+        value, field = getattr(message, name), within + name
         if isinstance(value, int | float):
-            yield f'{name}={value:+.4f}'
+            yield f'{field}={value:+.4f}'
         elif hasattr(value, 'get_fields_and_field_types'):
             if name != 'header':
-                yield from numbers(value)
+                yield from numbers(value, f'{field}.')
         elif 'covariance' not in name and not isinstance(value, str) and len(value) <= 8:
-            yield from (f'{x:+.4f}' for x in value if isinstance(x, float))
+            yield from (f'{field}[{k}]={x:+.4f}' for k, x in enumerate(value)
+                        if isinstance(x, float))
 
 
 def wait_for_type(node, topic):

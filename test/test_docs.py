@@ -86,7 +86,8 @@ class Runner:
     """Runs the blocks of a page in a folder, which is the working directory."""
 
     def __init__(self, name):
-        self._name, self._namespace, self._background = name, {'__name__': '__main__'}, []
+        self._name, self._namespace = name, {'__name__': '__main__'}
+        self.running = contextlib.ExitStack()
         for folder in ('config', 'examples', 'urdf'):
             Path(folder).symlink_to(ROOT / folder)
         # Executables, and the package where it is not installed.
@@ -125,28 +126,22 @@ class Runner:
             ['bash', '-euo', 'pipefail', '-c', block.text], stdin=subprocess.DEVNULL, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
             env=self._environment)
-        if block.mark == 'background':
-            self._background.append(process)
+        if block.mark == 'background':          # ended as by Ctrl-C
+            self.running.callback(ended, process, signal.SIGINT)
             return None
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.callback(ended, process, signal.SIGKILL)
             said, _ = process.communicate(timeout=TIMEOUT)
-        except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
         expected = block.mark.removeprefix('exit code ') or '0'
         assert str(process.returncode) == expected, f'{self._name}:{block.line}: {said}'
         return said
 
-    def end(self):
-        """End what runs in the background, as Ctrl-C does."""
-        for process in self._background:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGINT)
-            try:
-                process.communicate(timeout=TIMEOUT)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                raise
+
+def ended(process, number):
+    """Signal the group of a process, and wait for its end."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, number)
+    process.communicate(timeout=TIMEOUT)
 
 
 @pytest.mark.parametrize('page', [page for page in PAGES if any(
@@ -156,7 +151,7 @@ def test_the_code_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('COLUMNS', '118')
     runner, said, last = Runner(page.name), None, None
-    try:
+    with runner.running:
         for block in blocks(page.read_text()):
             if block.language == 'text' and block.follows and said is not None:
                 if not agrees(block.text.splitlines(), said.splitlines()):
@@ -164,8 +159,6 @@ def test_the_code_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeyp
             else:
                 said = None if block.mark.startswith('not run: ') else runner.run(block)
                 last = block
-    finally:
-        runner.end()
 
 
 def test_the_interface_page_is_written_from_the_present_code():

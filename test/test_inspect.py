@@ -178,11 +178,12 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
-def test_samples_that_are_far_apart_are_drawn(tmp_path, capsys):
+def test_samples_that_are_far_apart_are_drawn(tmp_path, capsys, monkeypatch):
     pytest.importorskip('matplotlib')
     pytest.importorskip('PIL.Image')
-    log = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'record.streams:=[pose]',
-                 '-p', 'pose.rate:=0.05')
+    monkeypatch.setattr(inspect, 'LONGEST_S', 0.1)
+    log = log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', 'record.streams:=[pose]',
+                 '-p', 'pose.rate:=2.0')
     assert told(capsys, log, '--animate', tmp_path / 'top.gif')[0] == 0
 
 

@@ -141,7 +141,8 @@ def test_a_scene_is_the_top_and_the_start_of_its_file(tmp_path):
     assert api_scene('wavy') == (parameters.top_of(values), parameters.start_state(values))
     assert api_scene(str(scene(tmp_path / 'mine.yaml', **{'top.mass': 3})))[0].mass == 3.0
     for name, told in (('shuttle', 'scene shuttle: its pivot moves'),
-                       ('lopping', r'^scene lopping: must be the path of a file, or one of brak')):
+                       ('lopping', r'^scene lopping: must be the path of a file, or one of brak'),
+                       (3, '^scene 3: must be the path of a file, or one of ')):
         with pytest.raises(ValueError, match=told):
             api_scene(name)
 

@@ -85,9 +85,8 @@ def test_a_log_shows_its_attitudes_and_motions(log, source, shown):
     assert shown.motion_at(change_ns + NANOSECONDS) is second
 
 
-@pytest.mark.parametrize('distance', [0.15, -0.15])
-def test_arrows_are_the_vectors_in_the_world(distance):
-    track = simulation.SimulatedTrack(values_of('cusp', **{'top.com_distance': distance}))
+def test_arrows_are_the_vectors_in_the_world():
+    track = simulation.SimulatedTrack(values_of('cusp', **{'top.com_distance': -0.15}))
     t_ns, top = 1_230_000_000, track.top
     exact = truth(track, t_ns)
     turn, up = Rotation.from_quat(exact.quaternion[0]), [0.0, 0.0, 1.0]
@@ -129,10 +128,6 @@ def test_plots_are_the_numbers_of_the_motion(shown):
     energy = exact.energy[0] - exact.l3[0] ** 2 / (2.0 * top.lambda3)
     assert turning.y == pytest.approx(energy) and plot.point == pytest.approx(energy)
     _, line = found['Effective potential V(θ)', 'V']
-    theta, l3, lz = math.radians(line.x[70]), exact.l3[0], exact.lz[0]
-    assert line.y[70] == pytest.approx(
-        (lz - l3 * math.cos(theta)) ** 2 / (2 * top.lambda1 * math.sin(theta) ** 2)
-        + top.gravity_torque * math.cos(theta))
     assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
 
 
@@ -249,12 +244,14 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
     desk.put('moment λ₁', -1.0)
     assert own.update(0.5) == 2_000_000_000
     assert desk.message.content.startswith('**refused:** ')
-    for label, value in (('mass', 3.0), ('length', 0.1), ('moment λ₁', 0.2), ('moment λ₃', 0.1)):
+    # A key moves a slider by a round step.
+    for slider in (one for one in desk.inputs.values() if hasattr(one, 'precision')):
+        assert 500 <= (slider.max - slider.min) / slider.step <= 5000
+        assert round(slider.step, slider.precision) == slider.step
+    for label, value in (('mass', 3.0), ('length', 0.1), ('moment λ₁', 0.2), ('moment λ₃', 0.1),
+                         ('tilt', 50.0), ('spin', 20.0), ('precession', 1.0)):
         desk.put(label, value)
         assert own.update(0.0) == 0
-    for label, value in (('tilt', 50.0), ('spin', 20.0), ('precession', 1.0)):
-        desk.put(label, value)
-        own.update(0.0)
     top = Top(mass=3.0, com_distance=0.1, lambda1=0.2, lambda3=0.1, gravity=9.80665)
     start = State.from_rates(math.radians(50.0), 1.0, 0.0, 20.0, top=top)
     track = own.track
@@ -262,12 +259,9 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
     assert track.state(NANOSECONDS).quaternion == pytest.approx(
         solve(top, start, [1.0]).quaternion, abs=1e-9)
     assert track.about.startswith('Scene looping with other numbers; ')
-    own.update(0.5)
-    assert own.update(0.5) == NANOSECONDS and own.track is track
     desk.put('scene', 'sleeping')
     assert own.update(0.25) == 250_000_000
     assert own.track.motion_at(0).description.name == 'sleeping'
-    assert own.track.about.startswith('Scene sleeping; ')
 
 
 def test_a_source_that_raises_an_error_is_asked_again_and_the_reason_is_shown(monkeypatch):
@@ -302,8 +296,9 @@ sys.exit(main(['view', '--scene', 'wavy', '--html', {str(path)!r}, '-p', 'durati
 
 
 @pytest.mark.parametrize(('arguments', 'told'), [
-    (['LOG', '--imu', 'bmi088'], '--imu bmi088: cannot be given for a log'),
-    (['--namespace', 'left'], '--namespace left: cannot be given for a simulation'),
+    (['LOG', '--imu', 'bmi088'], '--imu: cannot be given for a log'),
+    (['LOG', '--node'], '--node: cannot be given for a log'),
+    (['--namespace', 'left'], '--namespace: cannot be given for a simulation'),
     (['--ros-args', '-r', '__ns:=/left'], '--ros-args -r __ns:=/left: must be with --node'),
     (['-p', 'top.mas:=3'], 'top.mas:=3: there is no parameter top.mas; did you mean top.mass?'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
@@ -320,9 +315,8 @@ def test_a_page_of_another_site_is_refused(monkeypatch):
     with pytest.raises(OSError, match=f'127.0.0.1 port {port}: '):
         Page('two', '127.0.0.1', port)
     protocol = 'viser-v' + metadata.version('viser')
-    for origin in (page.address, None):         # None: no browser
-        with connect(f'ws://127.0.0.1:{port}', origin=origin, subprotocols=[protocol]) as one:
-            assert isinstance(one.recv(), bytes)
+    with connect(f'ws://127.0.0.1:{port}', origin=page.address, subprotocols=[protocol]) as one:
+        assert isinstance(one.recv(), bytes)
     with (connect(f'ws://127.0.0.1:{port}', origin='http://evil.example',
                   subprotocols=[protocol]) as one,
           pytest.raises(ConnectionClosed, match=r'1008.*Origin: http://evil')):
@@ -330,6 +324,7 @@ def test_a_page_of_another_site_is_refused(monkeypatch):
     page.close()
     for host, origin, is_refused in (
             ('LOCALHOST:8', 'http://localhost:8', False), ('127.0.0.1:8', 'null', True),
+            ('localhost:8', None, False),       # no browser
             # A name of another site that stands for this address.
             ('evil.example:8', 'http://evil.example:8', True), ('[::1', None, True)):
         headers = {'Host': host} | ({'Origin': origin} if origin else {})

@@ -115,6 +115,7 @@ def test_a_simulation_without_a_node(browser, tmp_path):
     with own:
         with Visit(browser, address_of(own)) as visit:
             visit.read('Scene looping; the title names the motion')
+            visit.wait("document.title === 'spinning top'")
             visit.wait("document.querySelectorAll('.plot polyline').length >= 7")
             visit.press('Pause')
             visit.press('Reset')

@@ -7,17 +7,15 @@ import threading
 
 import pytest
 import rclpy
+from geometry_msgs.msg import PoseStamped
 from helpers.desk import Desk
 from helpers.node_harness import SimNode, wait_for
-from helpers.simulations import play
+from helpers.simulations import SECOND
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import ReliabilityPolicy
 
 from spinning_top_sim import solve
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view.samples import SampledTrack
 
 pytest.importorskip('viser')
 from spinning_top_sim.view.node import NodeView
@@ -61,37 +59,37 @@ def test_a_running_node(desk, peer, tmp_path):
         wait_for('the button', lambda: desk.inputs['Pause'].label == 'Resume')
         desk.press('Pause')
         wait_for('loops', lambda: motion() == 'loops')
+        # The trace begins with a reset.
+        epoch_ns = view.track.epoch_ns
         desk.press('time', 'Reset')
         assert desk.message.content.startswith('reset: at t = 0')
+        wait_for('the stamp of t = 0',
+                 lambda: view.update(0.0) and view.track.epoch_ns != epoch_ns)
+        assert view.track.span[0] >= 0
+        # Another topic, where the one that tells most has gone; a pose has no rates.
+        for stream, topic in (('ground_truth_odom', 'joint_states'), ('joint_states', 'pose')):
+            assert view.track.motion_at(view.update(0.0)) is not None
+            assert peer.set_together(node, **{f'{stream}__enabled': False}).successful
+            wait_for(topic, lambda topic=topic: f'/seen/{topic}' in dict(
+                view.get_subscriber_names_and_types_by_node('view', '/seen')))
+        wait_for('samples of poses', lambda: view.track.motion_at(view.update(0.0)) is None)
+        # A page that hangs never makes the node wait.
+        listening, = view.get_subscriptions_info_by_topic('/seen/pose')
+        assert listening.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         assert node.end() == 0
         wait_for('the end', lambda: view.update(0.0) and 'has ended' in status.content)
+    # Another run, with an earlier clock.
+    again, pose = peer.node.create_publisher(PoseStamped, '/seen/pose', 10), PoseStamped()
+    pose.header.stamp.sec, pose.header.frame_id = 5, view.track.values['world_frame']
+
+    def began_again():
+        again.publish(pose)
+        return view.update(0.0) is not None and view.track.stamps_ns.tolist() == [5 * SECOND]
+
+    wait_for('the new run', began_again)
     view.stop()
     rclpy.try_shutdown()
     spinning.join()
-
-
-def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(desk, monkeypatch):
-    """Without ground_truth/odom, and where a new run has an earlier clock."""
-    values, view = parameters.checked({'spin.lz': 1.4}), NodeView(desk)
-    view._is_stale, view._track = False, SampledTrack(values)
-    for seconds, topic in ((100, 'ground_truth/odom'), (200, 'joint_states'), (300, 'pose'),
-                           (5, 'ground_truth/odom')):
-        epoch_ns = seconds * NANOSECONDS
-        monkeypatch.setattr(view, 'count_publishers', lambda name, only=topic: name == only)
-        view._listen()
-        assert view._listener.topic_name == f'/seen/{topic}'
-        # So a page that hangs never makes the node wait.
-        assert view._listener.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        taken = play(Simulation(values, epoch_ns), NANOSECONDS // 2, topic)
-        view._inbox.extend((topic, data) for topic, _, data in (*taken, (topic, 0, bytes(99))))
-        t_ns = view.update(0.0)
-        assert t_ns + view.track.epoch_ns == epoch_ns + NANOSECONDS // 2
-        assert (view.track.motion_at(t_ns) is None) is (topic == 'pose')    # which has no rates
-    # The trace begins with the last reset.
-    view._epoch_ns = epoch_ns + NANOSECONDS // 4
-    view.update(0.0)
-    assert view.track.span == (0, NANOSECONDS // 4)
-    view.stop()             # as where the start has failed
 
 
 def test_the_command_serves_a_page_until_a_signal(tmp_path):

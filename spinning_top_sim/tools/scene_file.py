@@ -159,7 +159,7 @@ def scene(name: str) -> tuple[Top, State]:
         For a name that is not known, a wrong file, or a scene whose pivot moves.
     """
     try:
-        path = file_of('scene', name)
+        path = file_of('scene', str(name))
     except ValueError as error:         # which names the option
         raise ValueError(str(error).removeprefix('--')) from None
     values = parameters.checked(read_scene(path))

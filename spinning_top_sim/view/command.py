@@ -79,8 +79,8 @@ def _check(arguments: argparse.Namespace) -> None:
                      ('a node', ('html', 'scene', 'imu', 'params', 'param'))
                      if arguments.node else ('a simulation', ('namespace',)))
     for option in foreign:
-        if value := getattr(arguments, option):
-            raise ValueError(f'--{option} {value}: cannot be given for {kind}')
+        if getattr(arguments, option):
+            raise ValueError(f'--{option}: cannot be given for {kind}')
     if arguments.port is not None and not 0 <= arguments.port <= 65535:
         raise ValueError(f'--port {arguments.port}: must be from 0 to 65535')
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page: scene, words and plots, made with viser; the same whatever its source is."""
 
+import html
+import json
 import math
 import threading
 import time
@@ -60,7 +62,9 @@ class Page:
         gui.set_panel_label(title)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
-        gui.add_html(f'<style>{STYLE}</style>')
+        # viser has no option for the title of the tab.
+        named = html.escape(f'document.title = {json.dumps(title)}')
+        gui.add_html(f'<style onload="{named}">{STYLE}</style>')
         self._words = gui.add_html(f'<p>{text.NO_SAMPLES}</p>')
         self.message = gui.add_markdown('')
         self.controls = gui.add_folder('Control')

@@ -24,7 +24,7 @@ from spinning_top_sim.view.source import WINDOW_NS, Track
 
 PERIOD_NS = 10_000_000          # between the points of a trace
 FILE_S = 20.0                   # length of a file, where `duration` is 0
-STEPS = 1000                    # of a slider
+STEPS = 500                     # of a slider at least
 # Name, unit and meaning of each slider.
 SLIDERS = (
     ('mass M', 'kg', 'mass of the top'),
@@ -118,8 +118,8 @@ class OwnSimulation:
         with page.controls:
             self._field = gui.add_dropdown('scene', tuple(self._files), initial_value=name)
         with page.controls, gui.add_folder('Top and start'):
-            self._sliders = [gui.add_slider(f'{label} [{unit}]', 0.0, 1.0, 1.0 / STEPS, 0.0,
-                                            hint=hint) for label, unit, hint in SLIDERS]
+            self._sliders = [gui.add_slider(f'{label} [{unit}]', 0.0, 1.0, 1e-3, 0.0, hint=hint)
+                             for label, unit, hint in SLIDERS]
         self._begin(name, values)
 
     def _begin(self, scene: str, values: Mapping[str, Any]) -> None:
@@ -143,7 +143,9 @@ class OwnSimulation:
                 numbers_of(self._plain), natural_momentum(parameters.top_of(self._plain))),
                 strict=True):
             slider.min, slider.max = min(low, number), max(high, number)
-            slider.step = (slider.max - slider.min) / STEPS
+            digits = math.ceil(math.log10(STEPS / (slider.max - slider.min)))
+            # More digits than a step has: those of the ends, and of what is typed.
+            slider.step, slider.precision = 10.0 ** -digits, max(digits, 0) + 2
             set_value(slider, number)
         self._shown = [slider.value for slider in self._sliders]
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference cases of data/reference_cases.json: 30 digits, from 70-digit arithmetic."""
 
+import functools
 import json
 import math
 from pathlib import Path
@@ -17,6 +18,7 @@ SCENES, RIDES = (sorted(path.stem for path in (ROOT / 'config').glob('*.yaml')
                         if ('  pivot.' in path.read_text()) == moves) for moves in (False, True))
 
 
+@functools.cache
 def scene_parameters(name):
     """Return the parameters that a scene file sets."""
     text = (ROOT / 'config' / f'{name}.yaml').read_text()

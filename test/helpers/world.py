@@ -11,6 +11,7 @@ import itertools
 import random
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -28,6 +29,7 @@ DATE_NS, SOURCE_NS = 1_700_000_000 * SECOND, 500 * SECOND
 QUIET_NS = 60 * MILLISECOND     # at the end, in which nothing happens
 QUEUE_BYTES = 20_000        # of the recorder, so that it is full sooner
 MOST_QUEUED = 10_000        # messages: a chunk, the queue, and what one tick may add
+NO_EXIT = SimpleNamespace(register=lambda act: None, unregister=lambda act: None)
 
 
 class Place(NamedTuple):
@@ -89,7 +91,7 @@ class World:
         self._begin_ns = machine.now_ns
         self.values = self._start = parameters.checked(plan.values)
         self.events, self.logs, self.readers, self.numbers = [], [], [], itertools.count()
-        self.answers, self.asked, self.deleted = [], 0, set()
+        self.answers, self.asked = [], 0
         self.wanted = {}                        # by topic of a subscriber: 'heard' or 'stalled'
         self._lost_ticks = self._cost_ns = self._cost_until_ns = 0
         self._date_ns = self._jump_ns = self._stops_at_ns = 0
@@ -172,15 +174,6 @@ class World:
         self.loop.change('drive', lambda: self.simulation.drive_details(velocity))
         self._drives = count * [velocity]
 
-    def resume(self):
-        """Time goes on from where it was held."""
-        loop, before_ns = self.loop, self.loop.now_ns
-        is_exact = (loop.paused and not self.plan.follows
-                    and self.machine.now_ns >= self._cost_until_ns)
-        loop.resume()
-        self._tick()
-        assert not is_exact or loop.now_ns == before_ns, 'nothing is caught up with'
-
     def reset(self, paused):
         momenta = {name: self._start[name] for name in ('spin.l3', 'spin.lz')}
         self.loop.reset({**self.values, **momenta}, paused)
@@ -223,20 +216,12 @@ class World:
     def fill_disk(self, room):
         self.disk.room = room
 
-    def delete_log(self):
-        """Remove it while it may be open."""
-        if self.logs:
-            self.logs[-1].file.unlink(missing_ok=True)
-            self.deleted.add(self.logs[-1])
-            self.disk.is_disturbed = True
-
     # ------------------------------------------------------------------------ the executor
 
     def run(self):
         """Run the plan."""
-        with (self.disk, mock.patch.object(recorder, 'atexit'),
-              mock.patch.object(recorder, 'QUEUE_BYTES', QUEUE_BYTES),
-              mock.patch.object(recorder, 'Recorder', Log)):
+        with (self.disk, mock.patch.multiple(
+                recorder, atexit=NO_EXIT, QUEUE_BYTES=QUEUE_BYTES, Recorder=Log)):
             self.machine.run(self._live)
         for one in (*self.readers, *self.logs):
             one.ends = one.ends or self.place

@@ -81,7 +81,7 @@ def plan_of(seed):
     streams = chance.sample([*STREAMS], chance.choice((1, 1, 1, 2)))
     values, topics = _values(chance, streams), [one for name in streams for one in STREAMS[name]]
     ends = chance.choice(('close', 'close', 'kill', 'cut'))
-    ends_ms = chance.choice((200, 400, 700))
+    ends_ms = chance.choice((200, 400, 600))
     is_calm = chance.random() < 0.2
     follows = not is_calm and chance.random() < 0.25
     kinds = [kind for kind in _kinds(chance, topics, values)
@@ -149,7 +149,7 @@ def _kinds(chance, topics, values):
         (3, 'jump_source', lambda: (pick((-9000, -300, 300, 4000, 9000)),)),
         (5, 'command', lambda: (momentum(), momentum())),
         (1, 'put', lambda: (pick((0.0, 0.3, 2.0, 9.0)), momentum(), momentum())),
-        (4, 'drive', lambda: (pick((0, 0, 3, 100)), *pick((
+        (4, 'drive', lambda: (pick((0, 0, 3, 20)), *pick((
             (0.0, 0.0, 0.0), (chance.uniform(-1.0, 1.0), 0.5, 0.0), (0.5, 0.0, 0.0),
             (0.5, 0.0, 0.0), (1e9, 0.0, 0.0))))),
         (1, 'pause', tuple),
@@ -165,5 +165,4 @@ def _kinds(chance, topics, values):
         (1, 'leave', topic),
         (1, 'stall', topic),
         (5, 'fault', lambda: (pick(CALLS), *pick(FAULTS))),
-        (0.5, 'fill_disk', lambda: (pick((100, 3000, 20_000)),)),
-        (0.3, 'delete_log', tuple)]
+        (0.5, 'fill_disk', lambda: (pick((100, 3000, 20_000)),))]
