@@ -102,7 +102,7 @@ class ThetaArrays:
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}
 
-    def phases(self, per_second: int, t: Column, t_low: Column | None,
+    def phases(self, per_second: int, t: Column,
                ) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
         """
         Return the three phases, (3, n) each; the arguments are those of `ExactStates`.
@@ -123,10 +123,7 @@ class ThetaArrays:
         rest += r1 * t2
         rest += r2 * t1
         rest += r2 * t2
-        small = rate_low * t
-        if t_low is not None:
-            small += rate * t_low
-        rest += small
+        rest += rate_low * t
         whole = np.rint(high)
         part = high - whole
         shift = part + self.start_offsets
@@ -187,17 +184,17 @@ class ExactStates(States):
     The states of an exact solution, on the branch of its start.
 
     per_second : 1 for times in s, 10^9 in ns
-    t, t_low : (n,) nearest doubles of the times, and what they leave out, if anything
+    t : (n,) times
     """
 
     method = 'exact'
 
     def __init__(self, top: Top, start: State, arrays: ThetaArrays, per_second: int, t: Column,
-                 t_low: Column | None = None) -> None:
+                 ) -> None:
         super().__init__(top, start, len(t))
-        self.t = t / per_second + (0.0 if t_low is None else t_low / per_second)
+        self.t = t / per_second
         self._arrays = arrays
-        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t, t_low)
+        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
