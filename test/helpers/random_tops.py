@@ -6,17 +6,16 @@ Random tops, seeded: log-uniform over decades, and dense on every special case o
 """
 
 import math
-
-import numpy as np
+import random
 
 from spinning_top_sim import State, Top
 
 
-class Draw:
+class Draw(random.Random):
     """Random numbers, and a top in its natural units: w0 = sqrt(P/lambda1), l0 = lambda1 w0."""
 
     def __init__(self, seed):
-        self.rng = np.random.default_rng([20230923, seed])
+        super().__init__(seed)
         self.lambda1 = self.log(-6, 3)
         self.lambda3 = self.lambda1 * self.log(-2, 0.7)
         self.mass, self.com_distance = self.log(-3, 3), self.log(-3, 1)
@@ -26,21 +25,15 @@ class Draw:
         torque = self.mass * self.gravity * self.com_distance
         self.w0 = math.sqrt(torque / self.lambda1)
         self.l0, self.critical = self.lambda1 * self.w0, 2.0 * math.sqrt(self.lambda1 * torque)
-        self.theta_dot = self.sign() * self.w0 * self.log(-3, 1) if self.chance(0.6) else 0.0
+        self.theta_dot = self.sign() * self.w0 * self.log(-3, 1) if self.random() < 0.6 else 0.0
         self.l3 = self.sign() * self.l0 * self.log(-2, 2)
         self.across(self.sign() * self.l0 * self.log(-2, 1))
-
-    def uniform(self, low, high):
-        return float(self.rng.uniform(low, high))
 
     def log(self, low, high):
         return 10.0 ** self.uniform(low, high)
 
-    def chance(self, probability):
-        return self.uniform(0.0, 1.0) < probability
-
     def sign(self):
-        return 1.0 if self.chance(0.5) else -1.0
+        return self.choice((1.0, -1.0))
 
     def across(self, momentum):
         """Set Lz so that the momentum across the axis, less that of theta', is this."""
@@ -53,17 +46,17 @@ def generic(d):
 
 
 def at_a_pole(d):
-    d.theta, d.lz = (0.0, d.l3) if d.chance(0.5) else (math.pi, -d.l3)
+    d.theta, d.lz = (0.0, d.l3) if d.random() < 0.5 else (math.pi, -d.l3)
 
 
 def next_to_a_pole(d):
-    d.theta = d.log(-16, -1) if d.chance(0.5) else math.pi - d.log(-15.5, -1)
+    d.theta = d.log(-16, -1) if d.random() < 0.5 else math.pi - d.log(-15.5, -1)
     d.across(d.sign() * d.l0 * d.log(-3, 1))
 
 
 def near_pass(d):
     """On its way to a near miss of a pole, or through it."""
-    d.lz = d.sign() * d.l3 * (1.0 + (d.sign() * d.log(-15.6, -2) if d.chance(0.7) else 0.0))
+    d.lz = d.sign() * d.l3 * (1.0 + (d.sign() * d.log(-15.6, -2) if d.random() < 0.7 else 0.0))
     d.theta_dot = d.sign() * d.w0 * d.log(-1, 1)
 
 
@@ -73,17 +66,16 @@ def planar(d):
 
 
 def no_torque(d):
-    setattr(d, ('mass', 'com_distance', 'gravity')[int(d.uniform(0, 3))], d.sign() * 0.0)
-    d.mass = abs(d.mass)
-    d.l3 = d.l3 if d.chance(0.8) else 0.0
-    if d.chance(0.3):
-        d.lz = d.l3 * (d.sign() if d.chance(0.5) else math.cos(d.theta))
+    setattr(d, d.choice(('mass', 'com_distance', 'gravity')), 0.0)
+    d.l3 = d.l3 if d.random() < 0.8 else 0.0
+    if d.random() < 0.3:
+        d.lz = d.l3 * (d.sign() if d.random() < 0.5 else math.cos(d.theta))
 
 
 def fast(d):
     """Spinning, with cusps or without."""
     d.l3 = d.sign() * d.critical * d.log(0.5, 4)
-    d.across(0.0 if d.chance(0.5) else d.sign() * d.l0 * d.log(-2, 1))
+    d.across(0.0 if d.random() < 0.5 else d.sign() * d.l0 * d.log(-2, 1))
 
 
 def near_separatrix(d):
@@ -100,16 +92,17 @@ def steady(d):
     d.l3 = d.sign() * d.critical * math.sqrt(max(cosine, 0.1)) * d.log(0.01, 2)
     root = math.sqrt(d.l3 ** 2 - 4.0 * d.lambda1 * torque * cosine)
     d.across(d.lambda1 * 2.0 * torque / (d.l3 + math.copysign(root, d.l3)) * math.sin(d.theta))
-    d.theta_dot, d.lz = 0.0, d.lz * (1.0 + (d.sign() * d.log(-16, -4) if d.chance(0.7) else 0.0))
+    d.theta_dot = 0.0
+    d.lz *= 1.0 + (d.sign() * d.log(-16, -4) if d.random() < 0.7 else 0.0)
 
 
 def near_rest(d):
     """Hanging, sleeping or waking, but for a little."""
-    hangs, aside = d.chance(0.5), d.log(-15, -3)
+    hangs, aside = d.random() < 0.5, d.log(-15, -3)
     d.theta, d.theta_dot = math.pi - aside if hangs else aside, 0.0
     d.l3 = d.l3 if hangs else d.sign() * d.critical * d.uniform(0.1, 4.0)
     d.across(0.0)
-    if d.chance(0.5):
+    if d.random() < 0.5:
         d.lz, d.theta_dot = -d.l3 if hangs else d.l3, d.w0 * d.log(-12, -2)
 
 
