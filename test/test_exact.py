@@ -17,8 +17,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from gmpy2 import get_context
-from helpers.random_tops import KINDS, random_case
+from helpers.random_tops import random_case
 from helpers.reference import CASES, ROOT, start_of, top_of
 from helpers.tops import EXACT, check_motion, time_limit
 
@@ -26,7 +25,6 @@ from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers import solve as solve_module
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.multiprecision import precision
 from spinning_top_sim.solvers.solve import motion_of
 
 
@@ -62,9 +60,9 @@ def test_states_agree_with_reference(case):
                              getattr(scale, name)) <= EXACT, name
 
 
-@pytest.mark.parametrize('seed', range(int(os.environ.get('TOPS', 3 * len(KINDS)))))
+@pytest.mark.parametrize('seed', range(int(os.environ.get('TOPS', 40))))
 def test_random_tops(seed):
-    """TOPS=20000 in the environment takes as many; three of each kind by default."""
+    """TOPS=20000 in the environment takes as many; 40 by default."""
     with time_limit(20.0):
         check_motion(*random_case(seed))
 
@@ -144,15 +142,6 @@ def test_angles_go_on_from_a_state_beyond_a_pole(method, state):
 def test_a_motion_too_fast_for_doubles_is_refused(method):
     with pytest.raises(ValueError, match=r'turns at .* rad/s: must be at most 1e\+100'):
         solve(UNIT, start(3e-133, l3=1.6, lz=1.1), [0.0], method=method)
-
-
-def test_the_precision_of_the_caller_does_not_matter():
-    times = range(10 ** 15, 10 ** 15 + 10 ** 7, 10 ** 6)
-    expected = ExactSolution(*LOOPING).states(times).quaternion
-    with precision(10):
-        get_context().trap_inexact = True
-        found = ExactSolution(*LOOPING).states(times).quaternion
-    assert (found == expected).all() and get_context().precision == 53
 
 
 def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():

@@ -115,7 +115,7 @@ class Motion:
 
 def states(case):
     """Return the states of a hard case at its times."""
-    top, start, found = top_of(case), start_of(case), {}
+    top, start, found = top_of(case), start_of(case), []
     plus, minus = mpfr(start.lz) + mpfr(start.l3), mpfr(start.lz) - mpfr(start.l3)
 
     def rates(q, omega, _):
@@ -124,19 +124,18 @@ def states(case):
             4 * mpfr(top.lambda1))
         return phi_dot, omega[2] - phi_dot * (cos2 - sin2)
 
-    for sense in (1, -1):
-        motion, now = Motion(top, start, rates, 2), 0
-        for t in sorted((t for t in case['times'] if t * sense > 0), key=abs):
-            motion.go_on(mpfr(t) - now)
-            now, ((x, y, z, w), (o1, o2, _), turned) = mpfr(t), motion.parts
-            phi, psi = numbers((start.phi, start.psi)) + turned
-            # cos(theta/2) = alpha exp(-i (phi + psi)/2), sin(theta/2) = beta exp(-i (phi - psi)/2)
-            a, b = (phi + psi) / 2, (phi - psi) / 2
-            theta = 2 * atan2(y * cos(b) - x * sin(b), w * cos(a) + z * sin(a))
-            found[t] = {'t': t, **{name: shown(value) for name, value in (
-                ('theta', theta), ('thetadot', o1 * sin(psi) + o2 * cos(psi)), ('phi', phi),
-                ('psi', psi))}, 'q': [*map(shown, (w, x, y, z))]}
-    return [found[t] for t in case['times']]
+    for t in case['times']:
+        motion = Motion(top, start, rates, 2)
+        motion.go_on(t)
+        (x, y, z, w), (o1, o2, _), turned = motion.parts
+        phi, psi = numbers((start.phi, start.psi)) + turned
+        # cos(theta/2) = alpha exp(-i (phi + psi)/2), sin(theta/2) = beta exp(-i (phi - psi)/2)
+        a, b = (phi + psi) / 2, (phi - psi) / 2
+        theta = 2 * atan2(y * cos(b) - x * sin(b), w * cos(a) + z * sin(a))
+        found.append({'t': t, **{name: shown(value) for name, value in (
+            ('theta', theta), ('thetadot', o1 * sin(psi) + o2 * cos(psi)), ('phi', phi),
+            ('psi', psi))}, 'q': [*map(shown, (w, x, y, z))]})
+    return found
 
 
 def shown(value):
