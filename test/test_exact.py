@@ -75,7 +75,6 @@ def start(theta, theta_dot=0.0, *, l3, lz):
 
 
 LOOPING = UNIT, start(0.6, l3=6.0, lz=4.5)
-FAST_SLEEPER = replace(UNIT, lambda3=0.001), start(0.0, l3=3.0, lz=3.0)
 NOTHING_MOVES = replace(UNIT, gravity=0.0), start(0.5, l3=0.0, lz=0.0)
 
 
@@ -91,16 +90,15 @@ def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold(
         solve(top, start(1e-150, l3=0.0, lz=0.0), [0.0])
 
 
+@pytest.mark.parametrize('sign', [1.0, -1.0])
 @pytest.mark.parametrize(('top', 'state', 'turns'), [
-    (*FAST_SLEEPER, 0.5 * 3.0 / 0.001 / math.tau),      # of (phi + psi)/2
+    (replace(UNIT, lambda3=0.001), start(0.0, l3=3.0, lz=3.0), 1500.0 / math.tau),
     (replace(UNIT, gravity=0.0), start(0.4, 250.0, l3=0.0, lz=0.0), 250.0 / math.pi)])
-def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(top, state, turns):
-    limit, solution = 2.0 ** 52 / turns, ExactSolution(top, state)
-    assert solution.time_limit == pytest.approx(limit, rel=1e-12)
-    for sign in (1.0, -1.0):
-        assert np.isfinite(solve(top, state, [sign * limit * (1.0 - 1e-9)]).phi).all()
-        with pytest.raises(ValueError, match='must be finite and within'):
-            solve(top, state, [0.0, sign * limit * (1.0 + 1e-9)])
+def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(top, state, turns, sign):
+    limit = sign * 2.0 ** 52 / turns
+    assert np.isfinite(solve(top, state, [limit * (1.0 - 1e-9)]).phi).all()
+    with pytest.raises(ValueError, match='must be finite and within'):
+        solve(top, state, [0.0, limit * (1.0 + 1e-9)])
 
 
 @pytest.mark.parametrize('motion', [LOOPING, NOTHING_MOVES])
@@ -140,7 +138,7 @@ def test_angles_go_on_from_a_state_beyond_a_pole(method, state):
 
 @pytest.mark.parametrize('method', ['exact', 'rk45'])
 def test_a_motion_too_fast_for_doubles_is_refused(method):
-    with pytest.raises(ValueError, match=r'turns at .* rad/s: must be at most 1e\+100'):
+    with pytest.raises(ValueError, match=r'rate of the axis must be at most 1e\+100 rad/s'):
         solve(UNIT, start(3e-133, l3=1.6, lz=1.1), [0.0], method=method)
 
 

@@ -137,6 +137,12 @@ def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
         piece.states(np.array([reached_ns + S // 10]))
 
 
+def test_the_exact_twin_of_a_piece_has_its_ride():
+    piece, longer = (Piece(TOP, State(theta=0.5, l3=1.6, lz=1.3), 0, ride((0.5, 0, 0))),
+                     ride((0.5, 0, 0))._replace(end_ns=9 * S))
+    assert piece.exact.ride is piece.ride and piece.with_ride(longer).exact.ride is longer
+
+
 def test_the_velocity_of_a_point_is_that_of_its_position():
     start, point = State(theta=0.5, theta_dot=0.3, l3=1.6, lz=1.3), (0.1, -0.2, 0.3)
     near = Piece(TOP, start, 0, ride((1.0, 2.0, 0.5)), method='exact').states(

@@ -14,8 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any
 
-# The largest of any number, and the inverse of the least moment of inertia: doubles hold the
-# products.
+# The largest number, and the inverse of the least moment of inertia: doubles hold the products.
 LARGEST = 1e50
 
 
