@@ -24,7 +24,7 @@ from helpers.tops import EXACT, check_motion, time_limit
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers import solve as solve_module
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
 
 
@@ -103,11 +103,11 @@ def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(top, state
 
 @pytest.mark.parametrize('motion', [LOOPING, NOTHING_MOVES])
 def test_a_range_has_the_bits_of_its_times_in_any_pieces(motion):
-    """Of nanoseconds and of years, backwards, and where the integers end."""
+    """Of nanoseconds and of years, backwards, where the integers end, and beyond one block."""
     solution = ExactSolution(*motion)
     end = 2 ** 63 - 1
     for times in (range(-3, 700), range(50_000 * 10 ** 9, 0, -10 ** 9), range(end - 2000, end, 3),
-                  range(-end, end, end // 7)):
+                  range(0, 2 * TIMES_TOGETHER * 10 ** 6 + 1, 10 ** 6), range(-end, end, end // 7)):
         of_range, of_array = solution.states(times), solution.states(np.array(times))
         for column in ('quaternion', 'theta', 'phi', 'angular_velocity'):
             expected = getattr(of_array, column)

@@ -23,7 +23,7 @@ from spinning_top_sim.physics.regimes import (
     precession_momentum,
     regime,
 )
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
@@ -33,6 +33,8 @@ from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
+# Times that are evaluated together: the temporaries of more do not fit into the cache.
+TIMES_TOGETHER = 8192
 
 
 class ExactSolution:
@@ -127,7 +129,9 @@ class ExactSolution:
             raise ValueError(
                 f't = {latest!r} s: must be finite and within {self.time_limit:.6g} s, where a '
                 'phase of this motion reaches 2^52 turns')
-        return ExactStates(self.top, self.start, self.arrays, per_second, t)
+        return joined([ExactStates(self.top, self.start, self.arrays, per_second,
+                                   t[k:k + TIMES_TOGETHER])
+                       for k in range(0, len(t) or 1, TIMES_TOGETHER)])
 
     def posture(self, t_ns: int, vertical: Vertical | None = None) -> Posture:
         """
