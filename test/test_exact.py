@@ -17,8 +17,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from gmpy2 import get_context
-from helpers.random_tops import KINDS, random_case
+from helpers.random_tops import random_case
 from helpers.reference import CASES, ROOT, start_of, top_of
 from helpers.tops import EXACT, check_motion, time_limit
 
@@ -26,7 +25,6 @@ from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers import solve as solve_module
 from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution
-from spinning_top_sim.solvers.multiprecision import precision
 from spinning_top_sim.solvers.solve import motion_of
 
 
@@ -36,47 +34,35 @@ def error(value, digits, start=0.0):
     return float(abs(Decimal(float(value)) - true) / max(1, abs(true), abs(Decimal(start))))
 
 
-def assert_states_are(states, references, start=None):
-    """Compare each state with its reference."""
-    for i, reference in enumerate(references):
-        x, y, z, w = states.quaternion[i]
-        assert max(map(error, (w, x, y, z), reference['q'])) <= EXACT
-        for name in ('theta', 'theta_dot', 'phi', 'psi'):
-            assert error(getattr(states, name)[i], reference[name.replace('_', '')],
-                         getattr(start, name) if start else 0.0) <= EXACT, name
+HARD_CASES = json.loads((ROOT / 'test/data/hard_cases.json').read_text())['cases']
 
 
-@pytest.mark.parametrize('case', CASES.values(), ids=CASES)
+@pytest.mark.parametrize('case', [*CASES.values(), *HARD_CASES], ids=lambda case: case['name'])
 def test_states_agree_with_reference(case):
-    """At seconds; and at those that are whole nanoseconds, alone and within a range."""
+    """
+    At seconds, and at those that are whole nanoseconds.
+
+    The hard cases have 28 digits (data/make_references.py): starts within 1e-26 to 1e-99 rad of a
+    pole that is passed, or 1e-19 to 1e-91 rad/s from a turning point, passages of a pole at
+    1e-11 rad, angles of many turns, and random tops.
+    """
     solution = ExactSolution(top_of(case), start_of(case))
-    assert_states_are(solution.states_at_seconds(np.array(case['times'])), case['states'])
+    scale = solution.start if case in HARD_CASES else State(theta=0.0, l3=0.0, lz=0.0)
     whole = [(ns.numerator, state) for state in case['states']
              if (ns := Fraction(state['t']) * 10 ** 9).denominator == 1]
-    assert_states_are(solution.states(np.array([ns for ns, _ in whole])), [
-        state for _, state in whole])
-    t, last = whole[-1]
-    grid = solution.states(range(t - 700 * 1_234_567, t + 700 * 1_234_567, 1_234_567))
-    assert max(map(error, np.roll(grid.quaternion[700], 1), last['q'])) <= EXACT
+    for states, references in (
+            (solution.states_at_seconds(np.array(case['times'])), case['states']),
+            (solution.states(np.array([ns for ns, _ in whole])), [state for _, state in whole])):
+        for i, reference in enumerate(references):
+            assert max(map(error, np.roll(states.quaternion[i], 1), reference['q'])) <= EXACT
+            for name in ('theta', 'theta_dot', 'phi', 'psi'):
+                assert error(getattr(states, name)[i], reference[name.replace('_', '')],
+                             getattr(scale, name)) <= EXACT, name
 
 
-@pytest.mark.parametrize(
-    'case', json.loads((ROOT / 'test/data/hard_cases.json').read_text())['cases'],
-    ids=lambda case: case['name'])
-def test_states_are_right_where_the_arithmetic_is_at_its_limits(case):
-    """
-    Against 28 digits, from Taylor series of Euler's equations (data/make_references.py).
-
-    Starts within 1e-26 to 1e-99 rad of a pole that is passed, or 1e-19 to 1e-91 rad/s from a
-    turning point, passages of a pole at 1e-11 rad, angles of many turns, and random tops.
-    """
-    start = start_of(case)
-    assert_states_are(solve(top_of(case), start, np.array(case['times'])), case['states'], start)
-
-
-@pytest.mark.parametrize('seed', range(int(os.environ.get('TOPS', 3 * len(KINDS)))))
+@pytest.mark.parametrize('seed', range(int(os.environ.get('TOPS', '40'))))
 def test_random_tops(seed):
-    """TOPS=20000 in the environment takes as many; three of each kind by default."""
+    """TOPS=20000 in the environment takes as many; 40 by default."""
     with time_limit(20.0):
         check_motion(*random_case(seed))
 
@@ -89,7 +75,6 @@ def start(theta, theta_dot=0.0, *, l3, lz):
 
 
 LOOPING = UNIT, start(0.6, l3=6.0, lz=4.5)
-FAST_SLEEPER = replace(UNIT, lambda3=0.001), start(0.0, l3=3.0, lz=3.0)
 NOTHING_MOVES = replace(UNIT, gravity=0.0), start(0.5, l3=0.0, lz=0.0)
 
 
@@ -105,20 +90,15 @@ def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold(
         solve(top, start(1e-150, l3=0.0, lz=0.0), [0.0])
 
 
+@pytest.mark.parametrize('sign', [1.0, -1.0])
 @pytest.mark.parametrize(('top', 'state', 'turns'), [
-    (*FAST_SLEEPER, 0.5 * 3.0 / 0.001 / math.tau),      # of (phi + psi)/2
+    (replace(UNIT, lambda3=0.001), start(0.0, l3=3.0, lz=3.0), 1500.0 / math.tau),
     (replace(UNIT, gravity=0.0), start(0.4, 250.0, l3=0.0, lz=0.0), 250.0 / math.pi)])
-def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(top, state, turns):
-    """Till then each nanosecond counts, though those beyond 2^53 ns are no doubles."""
-    limit, solution = 2.0 ** 52 / turns, ExactSolution(top, state)
-    assert solution.time_limit == pytest.approx(limit, rel=1e-12)
-    for sign in (1.0, -1.0):
-        assert np.isfinite(solve(top, state, [sign * limit * (1.0 - 1e-9)]).phi).all()
-        with pytest.raises(ValueError, match='must be finite and within'):
-            solve(top, state, [0.0, sign * limit * (1.0 + 1e-9)])
-    first, second = solution.states(np.array([2 ** 53 + 1, 2 ** 53 + 2])).quaternion
-    rate = np.linalg.norm(solution.states(range(1)).angular_velocity)
-    assert math.dist(first, second) == pytest.approx(0.5e-9 * rate, rel=1e-6)
+def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(top, state, turns, sign):
+    limit = sign * 2.0 ** 52 / turns
+    assert np.isfinite(solve(top, state, [limit * (1.0 - 1e-9)]).phi).all()
+    with pytest.raises(ValueError, match='must be finite and within'):
+        solve(top, state, [0.0, limit * (1.0 + 1e-9)])
 
 
 @pytest.mark.parametrize('motion', [LOOPING, NOTHING_MOVES])
@@ -156,25 +136,11 @@ def test_angles_go_on_from_a_state_beyond_a_pole(method, state):
                 getattr(expected, name), abs=1e-13 if method == 'exact' else 1e-7), name
 
 
-@pytest.mark.parametrize(('changed', 'state'), [
-    ({'lambda1': 1e-100}, start(1.9e-143, 0.4, l3=1.6, lz=1.1)),            # by all digits
-    ({'com_distance': 1.2229766755947465e-36, 'mass': 2.0},                 # by half of them
-     start(1.8816372025848537e-133, 0.4, l3=1.6, lz=7.077894324236906e47))])
-def test_constants_that_lose_the_start_are_refused(changed, state):
-    with pytest.raises(ValueError, match='too far apart'):
-        solve(replace(UNIT, **changed), state, [0.0])
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_a_motion_too_fast_for_doubles_is_refused(method):
+    with pytest.raises(ValueError, match=r'rate of the axis must be at most 1e\+100 rad/s'):
+        solve(UNIT, start(3e-133, l3=1.6, lz=1.1), [0.0], method=method)
 
 
-def test_the_precision_of_the_caller_does_not_matter():
-    times = range(10 ** 15, 10 ** 15 + 10 ** 7, 10 ** 6)
-    expected = ExactSolution(*LOOPING).states(times).quaternion
-    with precision(10):
-        get_context().trap_inexact = True
-        found = ExactSolution(*LOOPING).states(times).quaternion
-    assert (found == expected).all() and get_context().precision == 53
-
-
-def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():
+def test_the_example_of_solve_is_right():
     assert doctest.testmod(solve_module) == (0, 4)
-    with pytest.raises(TypeError, match=r'^solve\(State, Top, ...\): must be solve\(top'):
-        solve(*LOOPING[::-1], [0.0])

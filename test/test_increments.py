@@ -75,8 +75,6 @@ RUNS = {
               'ground_truth_imu_odom.rate': 3.0}, SECOND, (), (1e-13, 1e-9)),
     'fast': ({'imu.rate': 10_000.0, 'ground_truth_imu_odom.rate': 10_000.0}, SECOND // 5, (),
              (1e-13, 1e-13))}
-SAMPLED_MS = {'no event': range(0, 1001, 5), 'commands': range(0, 201, 5), 'rates': (
-    0, 5, 10, 15, 20, 23, 24, 25, 26, 27, 28, 29, 30, 40, 60, 80, 95, 100, 105, 110, 120)}
 
 
 @pytest.mark.parametrize('name', RUNS)
@@ -88,7 +86,6 @@ def test_every_increment_leads_from_one_sample_of_the_odometry_to_the_next(metho
                    events=events)
     (times_ns, _, dq), (*_, dv), (odometry_ns, _, position, orientation, velocity, rates) = (
         found.values())
-    assert name not in SAMPLED_MS or times_ns.tolist() == [ms * MS for ms in SAMPLED_MS[name]]
     places = np.searchsorted(odometry_ns, times_ns)
     assert np.array_equal(odometry_ns[places], times_ns)
     assert np.array_equal(dq[0], (0.0, 0.0, 0.0, 1.0)) and not dv[0].any()

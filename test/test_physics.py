@@ -22,14 +22,17 @@ RATES = {'precession': 1.0, 'spin': 2.0}
 @pytest.mark.parametrize(('make', 'given', 'field', 'value'), [
     *((Top, TOP, field, value) for field, value in (
         ('lambda1', 0.0), ('lambda3', math.inf), ('mass', -2.0), ('gravity', math.nan),
-        ('mass', None), ('gravity', True), ('mass', 10 ** 400))),
+        ('lambda3', 9e-51), ('com_distance', -2e50), ('mass', None), ('gravity', True),
+        ('mass', 10 ** 400))),
     *((State, STATE, field, value) for field, value in (
         ('theta', -1e-300), ('theta', math.nextafter(math.pi, 4.0)), ('phi', math.nan),
         ('lz', '1.0 kg'))),
+    *((State, {**STATE, 'theta': theta}, 'lz', lz) for theta, lz in (
+        (0.0, -1.6), (math.pi, 1.6))),      # at a pole only one is possible
     *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), **RATES}, field, value)
       for field, value in (('theta', -0.1), ('precession', math.nan), ('spin', '3 rad/s')))])
 def test_a_bad_constant_state_or_rate_is_refused_by_name_and_value(make, given, field, value):
-    with pytest.raises(ValueError, match=rf'{field} = .*must be') as error:
+    with pytest.raises(ValueError, match=rf'{field} = .*must ') as error:
         make(**{**given, field: value})
     assert repr(value) in str(error.value)
 
@@ -45,21 +48,6 @@ def test_a_state_from_rates_turns_at_them(theta):
     assert turned == pytest.approx(12.0 + 3.0 * math.cos(theta), rel=1e-14)
     if 1e-3 < theta < math.pi - 1e-3:
         assert motion.phi_dot[0] == pytest.approx(3.0, rel=1e-13)
-
-
-@pytest.mark.parametrize(('size', 'state'), [
-    (1e-200, State(theta=1.0, theta_dot=1e160, l3=0.0, lz=0.0)),
-    (1e200, State(theta=0.0, l3=1e160, lz=1e160))])
-def test_an_energy_that_doubles_hold_is_finite_where_the_square_of_the_rate_is_not(size, state):
-    top = Top(**{**TOP, 'lambda1': size, 'lambda3': size, 'mass': 0.0})
-    assert solve(top, state, [0.0]).energy[0] == pytest.approx(5e119, rel=1e-14)
-
-
-@pytest.mark.parametrize(('theta', 'lz', 'allowed'), [(0.0, 1.5, 1.6), (math.pi, 1.6, -1.6)])
-def test_at_a_pole_only_one_lz_is_possible(theta, lz, allowed):
-    with pytest.raises(ValueError, match=rf'lz = {lz} .*{allowed}'):
-        State(**{**STATE, 'theta': theta, 'lz': lz})
-    assert State(**{**STATE, 'theta': theta, 'lz': allowed}).lz == allowed
 
 
 @pytest.mark.parametrize(('start', 'expected'), [
@@ -127,8 +115,7 @@ def test_every_scene_is_valid_the_motion_it_says_and_drawn_with_its_mass_and_mom
 
 @pytest.mark.parametrize('changed', [
     {'mass': 0.0}, {'com_distance': -0.15}, {'com_distance': 0.0}, {'lambda3': 1.0},
-    {'mass': 5e-324}, {'lambda1': 1e300, 'lambda3': 1e300},
-    {'lambda1': 5e-324, 'lambda3': 5e-324}])
+    {'mass': 5e-324}, {'lambda1': 1e50, 'lambda3': 1e50}, {'lambda1': 1e-50, 'lambda3': 1e-50}])
 def test_every_top_can_be_drawn(changed):
     shape = Shape(Top(**{**TOP, **changed}))
     assert (shape.tip < 0.0) == (changed.get('com_distance', 0.0) < 0.0)
@@ -142,18 +129,11 @@ def test_every_top_can_be_drawn(changed):
     (math.pi, 0.0, 2.0, -1.0, 'hanging'), (0.8, -3.5, 0.5, 1.0, 'through the top'),
     (2.0, 3.5, 0.5, -1.0, 'through the bottom')])
 def test_a_motion_at_or_through_a_pole_has_its_name(theta, theta_dot, l3, lz, name):
-    """It sleeps where L3^2 > 4 lambda1 P; with lambda1 = P = 1 both sides are exact."""
+    """It sleeps where L3^2 > 4 lambda1 |P|; with lambda1 = P = 1 both sides are exact."""
     top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=1.0, gravity=1.0)
-    start = State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz * l3)
-    assert ExactSolution(top, start).describe().name == name
-
-
-@pytest.mark.parametrize(('distance', 'ratio'), [(0.5, 1.125), (-0.5, 1.125), (0.0, math.inf)])
-def test_the_gyroscopic_ratio_by_hand(distance, ratio):
-    """L3^2/(4 lambda1 |P|) with lambda1 = 0.25 and P = 2 x 0.5 x 8 = 8: 3^2/(4 x 0.25 x 8)."""
-    top = Top(lambda1=0.25, lambda3=0.15, mass=2.0, com_distance=distance, gravity=8.0)
-    start = State(theta=0.5, l3=3.0, lz=1.0)
-    assert ExactSolution(top, start).describe().gyroscopic_ratio == ratio
+    described = ExactSolution(
+        top, State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz * l3)).describe()
+    assert described.name == name and described.gyroscopic_ratio == 0.25 * l3 * l3
 
 
 @pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz', 'name'), [

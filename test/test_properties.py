@@ -6,7 +6,7 @@ import string
 import numpy as np
 import yaml
 from helpers.examples import examples
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from spinning_top_sim.streams import parameters
@@ -25,8 +25,6 @@ ANYTHING = st.recursive(
         st.dictionaries(KEYS, inner, max_size=3), st.lists(st.floats(), min_size=3, max_size=9),
         st.sets(st.floats(0.0, 1.0), min_size=3, max_size=3)), max_leaves=6) | st.lists(
             st.floats(), min_size=3, max_size=3).map(np.array)
-SHORT = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.dates())
 NAMES = st.sampled_from(sorted(parameters.BY_NAME))
 
 
@@ -49,17 +47,18 @@ def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
     assert default is None or type(values[name]) is type(default)
 
 
-YAML = st.text(st.sampled_from(string.ascii_letters + string.digits + ' \n\t:-[]{},&*!|>#\'"%@`~.'
-                               '\x00\x85\u2028\ud800\U0001f300'), max_size=60) | st.recursive(
-    SHORT, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(
-        NAMES | KEYS, inner, max_size=3)), max_leaves=8).map(lambda content: yaml.dump(
-            {'/**': {'ros__parameters': content}}, allow_unicode=True)) | st.tuples(
-                NAMES, st.integers(15_000, 20_000)).map(lambda pair: (
-                    f'/**: {{ros__parameters: {{{pair[0]}: [1.0, {1 << pair[1]:#x}]}}}}'))
+YAML = st.text(st.sampled_from(string.printable + '\x00\x85\u2028\ud800\U0001f300'), max_size=60)
+CONTENT = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.dates(),
+              st.text(max_size=5)),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(
+        NAMES | KEYS, inner, max_size=3)), max_leaves=8)
 
 
 @examples(60)
-@given(YAML)
+@given(YAML | CONTENT.map(lambda content: yaml.dump({'/**': {'ros__parameters': content}},
+                                                    allow_unicode=True)))
+@example(f'/**: {{ros__parameters: {{imu.rpy: [1.0, {1 << 15_000:#x}]}}}}')
 def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
     path = tmp_path / 'scene.yaml'
     path.write_bytes(text.encode(errors='surrogatepass'))

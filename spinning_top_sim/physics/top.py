@@ -14,6 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any
 
+# The largest number, and the inverse of the least moment of inertia: doubles hold the products.
+LARGEST = 1e50
+
 
 @dataclass(frozen=True, kw_only=True)
 class Top:
@@ -23,9 +26,9 @@ class Top:
     Parameters
     ----------
     lambda1 : float
-        Principal moment of inertia across the axis, *about the pivot* [kg m^2], > 0.
+        Principal moment of inertia across the axis, *about the pivot* [kg m^2], >= 1e-50.
     lambda3 : float
-        Principal moment of inertia along the axis [kg m^2], > 0.
+        Principal moment of inertia along the axis [kg m^2], >= 1e-50.
     mass : float
         Mass [kg], >= 0.
     com_distance : float
@@ -36,7 +39,7 @@ class Top:
     Raises
     ------
     ValueError
-        Naming the field, its value and what is allowed; also if the gravity torque overflows.
+        Naming the field, its value and what is allowed; no number may be larger than 1e50.
     """
 
     lambda1: float
@@ -48,14 +51,11 @@ class Top:
     def __post_init__(self) -> None:
         _freeze_as_floats(self)
         for name in ('lambda1', 'lambda3'):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f'{name} = {getattr(self, name)!r} kg m^2: must be > 0')
+            if getattr(self, name) < 1.0 / LARGEST:
+                raise ValueError(f'{name} = {getattr(self, name)!r} kg m^2: must be at least '
+                                 f'{1.0 / LARGEST:g}')
         if self.mass < 0.0:
             raise ValueError(f'mass = {self.mass!r} kg: must be >= 0')
-        if not math.isfinite(self.gravity_torque):
-            raise ValueError(
-                f'mass = {self.mass!r} kg, gravity = {self.gravity!r} m/s^2, com_distance = '
-                f'{self.com_distance!r} m: their product must be finite')
 
     @property
     def gravity_torque(self) -> float:
@@ -147,7 +147,7 @@ class State:
         ValueError
             Naming the argument or field, its value and what is allowed.
         """
-        theta, precession, spin = (_finite(name, value) for name, value in (
+        theta, precession, spin = (_float(name, value) for name, value in (
             ('theta', theta), ('precession', precession), ('spin', spin)))
         cosine = math.cos(theta)
         l3 = top.lambda3 * (spin + precession * cosine)
@@ -178,15 +178,15 @@ def shown(value: object) -> str:
 
 
 def _freeze_as_floats(record: Top | State) -> None:
-    """Store every field as a finite float, or say which one is not."""
+    """Store every field as a float, or say which one cannot be."""
     for field in fields(record):
-        object.__setattr__(record, field.name, _finite(
+        object.__setattr__(record, field.name, _float(
             field.name, getattr(record, field.name)))
 
 
-def _finite(name: str, value: Any) -> float:
-    """Return a value as a float.  Raises ValueError, naming it, if it is no finite number."""
+def _float(name: str, value: Any) -> float:
+    """Return a value as a float.  Raises ValueError, naming it, if it is no number in range."""
     with suppress(TypeError, ValueError, OverflowError):
-        if not isinstance(value, bool) and math.isfinite(number := float(value)):
+        if not isinstance(value, bool) and abs(number := float(value)) <= LARGEST:
             return number
-    raise ValueError(f'{name} = {shown(value)}: must be a finite number')
+    raise ValueError(f'{name} = {shown(value)}: must be a number of at most {LARGEST:g}')

@@ -105,9 +105,6 @@ def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -
                 return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
             except mp.RootsTooCloseError:
                 continue
-            except ArithmeticError as error:
-                raise ValueError(f'{top} from {start}: the constants are too far apart in size '
-                                 f'for the exact solution ({type(error).__name__})') from error
     raise ValueError(f'{top} from {start}: closer to the separatrix or to steady precession than '
                      f'{BITS_TO_TRY[-1]} bits can tell')
 

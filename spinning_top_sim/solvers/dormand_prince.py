@@ -140,7 +140,7 @@ class SteppedMotion(ABC):
         # The steps that can still be read, in order; the first one has no length.
         self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
         # A careful first step: the control finds the right one within a few.
-        self._next_step = 0.1 * math.pow(tolerance, 0.2) / (fastest_rate or 1.0)
+        self._next_step = 0.1 * math.pow(tolerance, 0.2) / max(fastest_rate, 1e-100)
         self.steps, self.evaluations = 0, 1
 
     @abstractmethod

@@ -95,14 +95,19 @@ class ThetaArrays:
         self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
+        # The sense in which theta/2 goes round, if both poles are passed, and its start.
+        self.sense = math.copysign(1.0, start.theta_dot) * self.sign * (len(self.zeros) == 2)
+        self.start_half = 0.5 * abs(start.theta - self.turn)
         self.u_dot = np.array([*map(float, motion.u_dot)])
         self.u_dot_coefficients = _highest_first(
             [[*map(float, motion.u_dot_series.polynomial(motion.size))]])
         self.precession, self.swing = np.array(
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
+        # Whether p + q theta1^2/D^2 loses no digits between the turning points; see `across`.
+        self.expands = self.u_dot.any() and not (self.stretch or self.on_line)
         self._scaled: dict[int, list[Matrix]] = {}
 
-    def phases(self, per_second: int, t: Column, t_low: Column | None,
+    def phases(self, per_second: int, t: Column,
                ) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
         """
         Return the three phases, (3, n) each; the arguments are those of `ExactStates`.
@@ -123,10 +128,7 @@ class ThetaArrays:
         rest += r1 * t2
         rest += r2 * t1
         rest += r2 * t2
-        small = rate_low * t
-        if t_low is not None:
-            small += rate * t_low
-        rest += small
+        rest += rate_low * t
         whole = np.rint(high)
         part = high - whole
         shift = part + self.start_offsets
@@ -142,44 +144,13 @@ class ThetaArrays:
         shift += self.start_wholes
         return high, rest, whole.astype(np.int64) + shift.astype(np.int64), part
 
-    @cached_property
-    def _middles(self) -> list[list[float]]:
-        """The rows where y = 0, at N = 0 and at N = 1."""
-        middles: list[list[float]] = np.where(
-            np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T.tolist()
-        return middles
-
-    @cached_property
+    @property
     def bounds(self) -> tuple[float, float]:
         """The least and the greatest theta in [0, pi] [rad]."""
+        middles = np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T
         low, high = sorted(2.0 * math.atan2(math.hypot(b, b_imag), math.hypot(a, a_imag))
-                           for a, b, a_imag, b_imag in self._middles)
+                           for a, b, a_imag, b_imag in middles.tolist())
         return low, high
-
-    @cached_property
-    def precesses_slowly(self) -> bool:
-        """
-        Whether p + q theta1^2/D^2 has smaller terms than the half angles have; see `across`.
-
-        Their largest values decide.  A fast top hardly precesses, and the half angles cancel.
-        """
-        if self.on_line or not self.u_dot.any():
-            return False
-        low, high = (0.5 * theta for theta in self.bounds)
-        least = min(math.sin(2.0 * low), math.sin(2.0 * high))
-        return 2.0 * max(abs(float(x)) for x in self.precession) < least * (
-            abs(self.bottom_rate) * math.tan(high) + abs(self.top_rate) / math.tan(low))
-
-    @cached_property
-    def planar_rotation(self) -> tuple[float, float] | None:
-        """(i, j) if both poles are passed: theta/2 is within a quarter turn of pi/2 (i + j N)."""
-        if len(self.zeros) < 2:
-            return None
-        first, second = (math.atan2(b, a) / QUARTER for a, b, *_ in self._middles)
-        slope = (second - first + 2.0) % 4.0 - 2.0
-        start_whole = float(self.start_wholes[0, 0])
-        start = (first + slope * start_whole + 1.0) % 4.0 - 1.0
-        return start - slope * start_whole, slope
 
 
 class ExactStates(States):
@@ -187,17 +158,17 @@ class ExactStates(States):
     The states of an exact solution, on the branch of its start.
 
     per_second : 1 for times in s, 10^9 in ns
-    t, t_low : (n,) nearest doubles of the times, and what they leave out, if anything
+    t : (n,) times
     """
 
     method = 'exact'
 
     def __init__(self, top: Top, start: State, arrays: ThetaArrays, per_second: int, t: Column,
-                 t_low: Column | None = None) -> None:
+                 ) -> None:
         super().__init__(top, start, len(t))
-        self.t = t / per_second + (0.0 if t_low is None else t_low / per_second)
+        self.t = t / per_second
         self._arrays = arrays
-        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t, t_low)
+        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
@@ -263,9 +234,10 @@ class ExactStates(States):
         arguments += (math.pi * arrays.drifts) * self._offset
         arguments[arrays.on_line] = 0.0
         half = np.arctan2(self.moduli[1], self.moduli[0])
-        if arrays.planar_rotation:
-            i, j = arrays.planar_rotation
-            half += math.tau * np.rint((QUARTER * (i + j * self._whole[0]) - half) / math.tau)
+        if arrays.sense:        # by less than half a turn it differs from this
+            turned = arrays.start_half + arrays.sense * QUARTER * (
+                self._whole[0] - arrays.start_wholes[0])
+            half += math.tau * np.rint((turned - half) / math.tau)
         return (math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
                 + ((arguments[0] + arguments[1]) + arrays.phi_phase),
                 arrays.sign * (2.0 * half) + arrays.turn,
@@ -300,10 +272,11 @@ class ExactStates(States):
         """
         Phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) [rad/s].
 
-        In half angles nothing cancels near a pole, and of a fast top nothing in the series.
+        In half angles nothing cancels near a pole, and of a fast top nothing in the series, whose
+        quarter periods are divided where u is half way: m is at most 1/2.
         """
         arrays, (alpha, beta) = self._arrays, self.moduli
-        if arrays.precesses_slowly:
+        if arrays.expands:
             series = self._sin_y * _horner(arrays.u_dot_coefficients, self._xi)
             momentum = (arrays.precession.take(self._parity) * (alpha * alpha + beta * beta)
                         + arrays.swing.take(self._parity) * (series * series))

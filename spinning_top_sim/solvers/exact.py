@@ -33,10 +33,6 @@ from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
-# Of a motion that gets there earlier [s], the digits of a phase overflow.
-SHORTEST = 1e-280
-# Doubles hold the constants of all motions whose numbers are between this and its inverse, or 0.
-USUAL = 1e-20
 # Times that are evaluated together: the temporaries of more do not fit into the cache.
 TIMES_TOGETHER = 8192
 
@@ -96,28 +92,6 @@ class ExactSolution:
                 (abs(self.mean_precession_rate) + abs(self.mean_spin_rate)) / (4.0 * math.pi))
             self.arrays = ThetaArrays(motion, start)
         self.theta_min, self.theta_max = self.arrays.bounds
-        # Only of sizes that are far apart: it takes a fourth of the time.
-        if gravity is None and not all(USUAL < abs(x) < 1.0 / USUAL for x in (
-                top.lambda1, top.lambda3, top.mass, top.com_distance, top.gravity,
-                start.theta, start.theta_dot, start.phi, start.psi, start.l3, start.lz) if x):
-            self._check_start()
-
-    def _check_start(self) -> None:
-        """Refuse constants so large, or so far apart, that doubles lose the start among them."""
-        start, arrays, held = self.start, self.arrays, self.time_limit > SHORTEST
-        if held:
-            with np.errstate(all='ignore'):
-                first = ExactStates(self.top, start, arrays, 1, np.zeros(1))
-                error = abs(float(first.theta_dot[0]) - start.theta_dot)
-            cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
-            across = sum(rate * x / y for rate, x, y in (       # phi' sin(theta)
-                (arrays.bottom_rate, sine, cosine), (arrays.top_rate, cosine, sine)) if rate)
-            # Relative to a small velocity of the axis.  Where theta is lost, its rate is, too.
-            held = error <= 1e-14 * min(
-                math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot)))
-        if not held:
-            raise ValueError(f'the constants of {self.top} and {start} are too far apart in size '
-                             'for doubles to hold the motion')
 
     def describe(self, coincide: float = COINCIDE) -> Description:
         """
@@ -142,27 +116,22 @@ class ExactSolution:
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at integer nanoseconds (n,), in any order and of any sign."""
-        count = ns_array(times_ns)
-        t, t_low = count.astype(np.float64), None
-        if np.abs(t).max(initial=0.0) >= 2.0 ** 53:
-            # Half of it, as `t` may be 2^63.
-            t_low = (count - 2 * (0.5 * t).astype(np.int64)).astype(np.float64)
-        return self._states_at(NANOSECONDS, t, t_low)
+        """Return the states at nanoseconds (n,), in any order and of any sign."""
+        return self._states_at(NANOSECONDS, ns_array(times_ns).astype(np.float64))
 
     def states_at_seconds(self, t: Column) -> States:
         """Return the states at t (n,) [s], in any order and of any sign."""
         return self._states_at(1, t)
 
-    def _states_at(self, per_second: int, t: Column, t_low: Column | None = None) -> States:
+    def _states_at(self, per_second: int, t: Column) -> States:
         latest = float(np.abs(t).max(initial=0.0)) / per_second
         if not latest <= self.time_limit:       # catches NaN too
             raise ValueError(
                 f't = {latest!r} s: must be finite and within {self.time_limit:.6g} s, where a '
                 'phase of this motion reaches 2^52 turns')
-        parts = (slice(k, k + TIMES_TOGETHER) for k in range(0, len(t) or 1, TIMES_TOGETHER))
-        return joined([ExactStates(self.top, self.start, self.arrays, per_second, t[part],
-                                   None if t_low is None else t_low[part]) for part in parts])
+        return joined([ExactStates(self.top, self.start, self.arrays, per_second,
+                                   t[k:k + TIMES_TOGETHER])
+                       for k in range(0, len(t) or 1, TIMES_TOGETHER)])
 
     def posture(self, t_ns: int, vertical: Vertical | None = None) -> Posture:
         """

@@ -19,7 +19,7 @@ from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
 from spinning_top_sim.solvers.solve import motion_of
-from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical, posture_at
+from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
 from spinning_top_sim.times import NANOSECONDS, ns_array
 
 if TYPE_CHECKING:
@@ -104,15 +104,13 @@ class Piece:
             self.top, states, self._vertical.rotation, self.ride, times_ns)
 
     @cached_property
-    def _exact(self) -> Piece | None:
+    def exact(self) -> Piece | None:
+        """The same piece by the closed form; None where doubles cannot hold that."""
+        if not isinstance(self.motion, SteppedMotion):
+            return self
         with suppress(ImportError, ValueError):
             return Piece(self.top, self._start, self.start_ns, self.ride, method='exact')
         return None
-
-    @property
-    def exact(self) -> Piece | None:
-        """The same piece by the closed form; None where doubles cannot hold that."""
-        return self._exact if isinstance(self.motion, SteppedMotion) else self
 
     def describe(self) -> Description | None:
         """Return the motion in numbers; None if it has no closed form or the pivot moves."""
@@ -123,7 +121,10 @@ class Piece:
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time, for what follows."""
         if isinstance(self.motion, SteppedMotion):
-            return posture_at(self.states(np.array([t_ns])))
+            states = self.states(np.array([t_ns]))
+            x, y, z, w, o1, o2 = (float(part[0]) for part in (
+                *states.rows_quaternion, *states.transverse_velocity))
+            return Posture(complex(w, z), complex(y, -x), complex(o1, o2), states.start.l3)
         return self.motion.posture(t_ns - self.start_ns, self._vertical)
 
     def forget(self, before_ns: int) -> None:
@@ -135,4 +136,5 @@ class Piece:
         """Return this motion where the pivot has the same acceleration till another end."""
         changed = copy(self)
         changed.ride = ride
+        changed.__dict__.pop('exact', None)     # it has the old ride
         return changed

@@ -18,7 +18,7 @@ from spinning_top_sim.solvers.dormand_prince import (
     Unknowns,
     components,
 )
-from spinning_top_sim.solvers.vertical import Posture, PreciseState
+from spinning_top_sim.solvers.vertical import Posture
 
 # The energy corrects the nutation rate only where its square is at least this share of the
 # largest |m|^2: at a turning point the energy does not tell the rate.
@@ -61,8 +61,8 @@ class TransportMotion(SteppedMotion):
     posture : of `start`, in doubles that know more of it
     """
 
-    def __init__(self, top: Top, start: State, rtol: float, atol: float,
-                 posture: Posture | None = None) -> None:
+    def __init__(self, top: Top, start: State, posture: Posture, rtol: float,
+                 atol: float) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
         self.top, self._l3, self._lz = top, l3, lz
         carried = 0.5 * l3          # c: so the spectrum of alpha and beta is centred about zero
@@ -73,7 +73,7 @@ class TransportMotion(SteppedMotion):
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, across, _ = posture or PreciseState.of(start).posture(top)
+        alpha, beta, across, _ = posture
         # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
         m = 0.5j * (alpha * alpha * across - beta * beta * across.conjugate()
                     + 2.0 * alpha * beta * (l3 / lambda1))

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.pivot import Fractions
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, pole_momentum
 
 # Numbers of Python or of gmpy2.
@@ -178,13 +177,6 @@ class Vertical(NamedTuple):
     def to_world(self, posture: Posture) -> Posture:
         """Return a posture in this frame as one in the world."""
         return _turned(posture, self.alpha, self.beta)
-
-
-def posture_at(states: States) -> Posture:
-    """Return the posture of states (n = 1) in the world, as far as doubles know it."""
-    x, y, z, w, o1, o2 = (float(part[0]) for part in (
-        *states.rows_quaternion, *states.transverse_velocity))
-    return Posture(complex(w, z), complex(y, -x), complex(o1, o2), states.start.l3)
 
 
 def state_of(top: Top, quaternion: NDArray[np.float64],
