@@ -142,5 +142,7 @@ def test_a_motion_too_fast_for_doubles_is_refused(method):
         solve(UNIT, start(3e-133, l3=1.6, lz=1.1), [0.0], method=method)
 
 
-def test_the_example_of_solve_is_right():
+def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():
     assert doctest.testmod(solve_module) == (0, 4)
+    with pytest.raises(TypeError, match=r'^solve\(State, Top, ...\): must be solve\(top'):
+        solve(*LOOPING[::-1], [0.0])

@@ -96,6 +96,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
 
     Raises
     ------
+    TypeError
+        If `top` is no Top or `start` no State.
     ImportError
         If 'exact' misses gmpy2.
     ValueError
@@ -113,6 +115,9 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     >>> motion.theta.round(6)
     array([0.5     , 0.630905, 0.86732 ])
     """
+    if not (isinstance(top, Top) and isinstance(start, State)):
+        raise TypeError(f'solve({type(top).__name__}, {type(start).__name__}, ...): must be '
+                        'solve(top, start, t) with a Top and a State')
     try:
         times = np.asarray(np.ma.filled(t, math.nan)).astype(np.float64, casting='same_kind')
     except (TypeError, ValueError) as error:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 KEPT = Path(__file__).parents[1] / 'data' / 'golden.json'
+SAMPLES = 6         # of each column are kept with all their digits, and of all a digest
 IMU = {'imu.enabled': True, 'imu_data.enabled': True, 'ground_truth_imu_odom.enabled': True,
        'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.1, 0.2, -0.3]}
 SHUTTLE = {'pivot.waypoints': [0.0, 0.0, 0.0, 1.0, 0.0, 0.5], 'pivot.repeat': True,
@@ -68,9 +69,14 @@ def columns(case):
 
 
 def golden(case):
-    """Return a digest of each column of a case that is not constant."""
-    return {name: hashlib.sha256(column.tobytes()).hexdigest()[:16]
-            for name, column in columns(case).items() if np.ptp(column)}
+    """Return what is kept of a case: of each column, a digest and some numbers in full."""
+    kept = {}
+    for name, column in columns(case).items():
+        digest = hashlib.sha256(column.tobytes()).hexdigest()[:16]
+        if np.ptp(column) and digest not in {one for one, *_ in kept.values()}:
+            kept[name] = [digest, *(x.hex() for x in column[
+                ::-(-len(column) // SAMPLES)].tolist())]
+    return kept
 
 
 def computed():
