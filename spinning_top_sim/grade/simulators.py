@@ -222,18 +222,14 @@ class Judgement:
         return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
 
     def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
-        """Yield the largest error, and relative changes of the constants of the motion."""
+        """Yield the largest error, the relative change of the energy, and the order."""
         yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
                                                       math.degrees(self.tolerance))
         smoothed = Smoothed(motion.told, 1)
-        w, up = smoothed.rates, smoothed.turn[:, 2]
-        momenta = w * self.body.inertia
-        for name, values in (
-                ('energy', 0.5 * np.sum(momenta * w, axis=1)
-                 + self.body.gravity_torque * up[:, 2]),
-                ('l3', momenta[:, 2]), ('lz', np.sum(momenta * up, axis=1))):
-            yield f'{name}_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
-                values, float(values[0]))))))
+        w, up = smoothed.rates, smoothed.turn[:, 2, 2]
+        energy = 0.5 * w ** 2 @ self.body.inertia + self.body.gravity_torque * up
+        yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
+            energy, float(energy[0]))))))
         if motion.name in self.orders:
             yield f'order: {motion.name}', Mark(self.orders[motion.name])
 
