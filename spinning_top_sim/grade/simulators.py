@@ -174,23 +174,21 @@ class Judgement:
             other = errors_of(told, late)
             if np.max(other[early]) < RIGHT * error and np.median(other) < RIGHT * np.median(
                     errors):
-                self._tell('late' if late > 0 else 'early', f'{name}: the attitudes are those of '
-                           f'one step {"before" if late > 0 else "after"}', float(late))
+                self.faults.append(Finding(
+                    'late' if late > 0 else 'early', f'{name}: the attitudes are those of '
+                    f'one step {"before" if late > 0 else "after"}', float(late)))
                 return Motion(name, told, float(np.max(other)))
         if error > WRONG:
             q = told.rotation.as_quat()
             found = conventions.best(q[early], solution.states_at_seconds(
                 told.t[early]).quaternion)
             if found.convention.parts and found.after < RIGHT * found.before:
-                self._tell('convention', f'{name}: attitudes are told as {found.convention.name}; '
-                           'this is undone', found.before)
+                self.faults.append(Finding(
+                    'convention', f'{name}: attitudes are told as {found.convention.name}; '
+                    'this is undone', found.before))
                 told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
                 errors = errors_of(told)
         return Motion(name, told, float(np.max(errors)))
-
-    def _tell(self, name: str, evidence: str, number: float) -> None:
-        if name not in [fault.name for fault in self.faults]:
-            self.faults.append(Finding(name, evidence, number))
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
