@@ -257,8 +257,11 @@ class Causes:
             'finite_differences', f'the acceleration, without gravity, is that of {delay:.3g} '
             'steps before, as a difference of two velocities', delay)
 
-    def _arm(self, found: Reals) -> Verdict:
+    def _arm(self, found: Reals) -> Verdict | None:
         arm, point = self.compared.arm, found[-3:] + self.compared.arm
+        share = float(point @ arm) / (float(arm @ arm) or 1.0)
+        if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * np.linalg.norm(point):
+            return self._term('lever', np.array([share - 1.0]))
         return Verdict('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
                        f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
 
