@@ -80,6 +80,11 @@ def test_with_the_step_of_a_game_the_fast_spin_is_left_out():
     assert 'total_error_deg: fast spin' not in report.marks
 
 
+def test_a_lever_arm_of_another_length_is_a_scale_in_slow_motions_too():
+    report = grade(Imu(defect='wrong dt'), scenes=SHORT[1:2], dt=0.004)
+    assert report.faults == ['acceleration_scale'], report
+
+
 def test_without_rates_those_of_the_attitudes_serve():
     parts = ('accelerations', 'gyroscope')
     for simulator, faults in (

@@ -162,7 +162,7 @@ class Causes:
                     'gravity', 'linear', 'motion')):
                 yield Cause([name], partial(self._term, name))
         yield Cause(['difference'], self._difference)
-        yield Cause(['gravity', 'gravity fixed'], instead(
+        yield Cause(['gravity', 'fixed gravity'], instead(
             'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
         arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
         yield Cause([f'{arm} {k}' for k in range(3)], judged)
@@ -215,10 +215,10 @@ class Causes:
         if len(found) > 3 and self.kind == 'magnetometer' and np.linalg.norm(
                 found[:3] + field) < NEAR * np.linalg.norm(field):
             return None                         # the field does not turn with the IMU
+        si = next(iter(self.compared.units))
         # Where w x (w x r) is not known its mean seems to be a bias.
         coarse = self.noisy and self.kind == 'accelerations' and SURE * (
             self.compared.fit(['centripetal', *self.compared.always]).sigma[0]) > TELLS
-        si = next(iter(self.compared.units))
         return Verdict('bias' * (not coarse), f'a constant ({listed(offset)}) {si} is added',
                        float(np.linalg.norm(offset)))
 

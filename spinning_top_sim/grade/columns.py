@@ -286,7 +286,7 @@ class Comparison:
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
             **({'linear': motion.acceleration} if np.any(motion.acceleration) else {}),
             'lever': lever, 'motion': moved, 'total': gravity + moved,
-            'gravity fixed': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
+            'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.
             'difference': along(motion.back, _per_step(along(motion.turn, moved))),
             # A lever arm that is longer by 1 m along axes of the body, and a x r alone.

@@ -95,8 +95,13 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
     return Report(subject, judgement.faults, {}, notes).plus(*judgement.reports())
 
 
-def told_motion(said: Any, times: Reals) -> Stretch:
-    """Return the motion that a run has said.  Raises InvalidTrajectoryError."""
+def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Stretch:
+    """Return the motion that a run says.  Raises InvalidTrajectoryError."""
+    try:
+        said = run(body, start, times.copy(), dt)
+    except (Exception, SystemExit) as error:
+        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
+                                     f'{one_line(error)}') from error
     said = said if isinstance(said, Mapping) else {'attitudes': said}
     readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
                 for name in ('attitudes', *KINDS) if said.get(name) is not None}
@@ -146,16 +151,9 @@ class Judgement:
         """Add the motion of a scene.  Raises InvalidTrajectoryError."""
         times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
 
-        def motion() -> Stretch:
-            try:
-                said = run(self.body, start, times.copy(), self.dt)
-            except (Exception, SystemExit) as error:
-                raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
-                                             f'{one_line(error)}') from error
-            return told_motion(said, times)
-
-        told = motion()
-        if not self.motions and not np.array_equal(told.matrices, motion().matrices):
+        told, *again = (told_motion(run, self.body, start, times, self.dt)
+                        for _ in range(1 if self.motions else 2))
+        if again and not np.array_equal(told.matrices, again[0].matrices):
             self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
                                        'same run twice differ'))
         self.motions.append(self.beside_truth(scene.name, start, told))
