@@ -125,11 +125,13 @@ class Timed:
 def measured(entry: Entry) -> dict[str, Any]:
     """Return what the table has of an engine."""
     run = Timed(entry)
-    scenes = SCENES if entry.whole else SCENES[:1]
+    scenes = SCENES if entry.whole else [replace(SCENES[0], divided=(1,))]
     found = grade(run, dt=entry.dt, scenes=scenes, subject=entry.key)
     first = SCENES[0].name
     marks = {name: found.measures.get(f'{name}: {first}', math.nan) for name in (
-        'total_error_deg', 'energy_drift')}
+        'total_error_deg', 'energy_drift', 'order')}
+    if not entry.options.keys().isdisjoint({'accuracy', 'rtol'}) or entry.setting == 'default':
+        marks['order'] = math.nan           # the step is not dt
     return {**marks, 'cost': run.spent / run.simulated if run.simulated else math.nan,
             'faults': found.faults, 'text': str(found)}
 
@@ -141,9 +143,9 @@ def row(entry: Entry) -> tuple[str, ...]:
         found = json.loads(done.stdout.splitlines()[-1])
     except (subprocess.SubprocessError, ValueError, IndexError) as error:
         print(getattr(error, 'stderr', None) or error, file=sys.stderr)
-        return entry.name, entry.setting, *3 * ('–',), 'does not run here'
+        return entry.name, entry.setting, *4 * ('–',), 'does not run here'
     print(found['text'], flush=True)
-    numbers = [found[name] for name in ('total_error_deg', 'energy_drift')]
+    numbers = [found[name] for name in ('total_error_deg', 'energy_drift', 'order')]
     return (entry.name, entry.setting, *(report.number(None if math.isnan(value) else value)
                                          for value in (*numbers, 1e3 * found['cost'])),
             ', '.join(f'`{name}`' for name in found['faults']) or 'none')
@@ -158,7 +160,7 @@ def main() -> None:
     if wanted:
         print(json.dumps(measured(next(entry for entry in ENTRIES if entry.key == wanted))))
         return
-    heads = ('engine', 'step', 'error [deg]', 'energy drift', 'ms', 'faults')
+    heads = ('engine', 'step', 'error [deg]', 'energy drift', 'order', 'ms', 'faults')
     head, rows = report.preamble('Engines and integrators', PACKAGES), []
     with ThreadPoolExecutor(TOGETHER) as pool:
         for found in pool.map(row, ENTRIES):        # whoever stops it keeps the rows before
@@ -169,9 +171,10 @@ def main() -> None:
 TEXT = f"""\
 A bicycle wheel on a ball joint moves for 10 s on cusps, the first scene of `grade`. `error` is
 the largest angle to the exact attitude, `energy drift` is relative to the energy at the start,
-and `ms` is the processor time of a simulated second, with a sample read after every step from
-Python. `faults` are those that `grade` names with a tolerance of 0.1 degrees: in all scenes at the
-first step, in the cusps alone at the finer one, 1/{FINER} of it.
+`order` is that in which the error falls with the step, and `ms` is the processor time of a
+simulated second, with a sample read after every step from Python. `faults` are those that `grade`
+names with a tolerance of 0.1 degrees: in all scenes at the first step, in the cusps alone at the
+finer one, 1/{FINER} of it.
 
 Every engine runs as its documentation shows. The first step is the default where there is one,
 else that of its examples. Damping that is on by default is switched off, as the top has none. A

@@ -48,8 +48,8 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
         body (n, 3) [rad/s], `gyroscope`, `accelerations`, `magnetometer`, readings in the frame
         of the IMU (n, 3), SI.  The first time is 0, and all are multiples of dt.
     dt : float
-        The step [s], also that between samples.  A scene in which the top turns by more than
-        0.7 rad in a step is left out.
+        The step [s].  Samples are dt apart, also where the order of convergence is measured with
+        smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
     body : Body
         The top and the IMU on it.
     scenes : sequence of Scene
@@ -146,17 +146,24 @@ class Judgement:
         self.body, self.dt, self.tolerance = body, dt, tolerance
         self.motions: list[Motion] = []
         self.faults: list[Finding] = []
+        self.orders: dict[str, float] = {}
 
     def run(self, run: Simulate, scene: Scene, start: Start) -> None:
         """Add the motion of a scene.  Raises InvalidTrajectoryError."""
         times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
 
-        told, *again = (told_motion(run, self.body, start, times, self.dt)
-                        for _ in range(1 if self.motions else 2))
-        if again and not np.array_equal(told.matrices, again[0].matrices):
+        told = [told_motion(run, self.body, start, times, self.dt / divided)
+                for divided in scene.divided]
+        if not self.motions and not np.array_equal(told[0].matrices, told_motion(
+                run, self.body, start, times, self.dt).matrices):
             self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
                                        'same run twice differ'))
-        self.motions.append(self.beside_truth(scene.name, start, told))
+        same = [self.beside_truth(scene.name, start, one) for one in told]
+        self.motions.append(same[0])
+        errors = [one.worst for one in same]
+        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding: errors ~ dt^p
+            self.orders[scene.name] = -float(np.polyfit(
+                np.log(scene.divided), np.log(errors), 1)[0])
 
     def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
@@ -212,7 +219,7 @@ class Judgement:
         return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
 
     def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
-        """Yield the largest error, and the relative change of the energy."""
+        """Yield the largest error, the relative change of the energy, and the order."""
         yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
                                                       math.degrees(self.tolerance))
         smoothed = Smoothed(motion.told, 1)
@@ -220,15 +227,22 @@ class Judgement:
         energy = 0.5 * w ** 2 @ self.body.inertia + self.body.gravity_torque * up
         yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
             energy, float(energy[0]))))))
+        if motion.name in self.orders:
+            yield f'order: {motion.name}', Mark(self.orders[motion.name])
 
     def _of_motions(self) -> Iterator[Finding]:
         worst = max(self.motions, key=lambda motion: motion.worst)
         if worst.worst <= self.tolerance:
             return
         text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        causes = dynamics.faults_of(
+        first = [(scene, order) for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
+        for scene, order in first:
+            yield Finding('first_order', f'{text}; {scene}: the error falls as dt^{order:.2f}',
+                          order)
+        causes = [fault for fault in dynamics.faults_of(
             self.body, [motion.told for motion in self.motions], self.dt)
+            if not (first and fault.name == 'first_order')]
         yield from (Finding(fault.name, f'{text}; {fault.evidence}', fault.number)
                     for fault in causes)
-        if not causes:
+        if not (first or causes):
             yield Finding('inaccurate', text, math.degrees(worst.worst))
