@@ -103,7 +103,7 @@ ENTRIES = (
 
 
 class Timed:
-    """Runs an engine; adds up the processor time of runs with the step dt that are repeated."""
+    """Runs an engine; adds up the processor time of runs that are repeated."""
 
     def __init__(self, entry: Entry) -> None:
         module, name = entry.place.split(':')
@@ -115,12 +115,10 @@ class Timed:
     def __call__(self, top: Any, start: Any, times: Any, dt: float) -> Any:
         began = time.process_time()
         said = self._run(top, start, times, dt, **self._entry.options)
-        if math.isclose(dt, self._entry.dt):
-            this = start.attitude, len(times)
-            if this in self._runs:      # before, something may have been compiled
-                self.spent += time.process_time() - began
-                self.simulated += times[-1]
-            self._runs.add(this)
+        if start.attitude in self._runs:        # before, something may have been compiled
+            self.spent += time.process_time() - began
+            self.simulated += times[-1]
+        self._runs.add(start.attitude)
         return said
 
 

@@ -90,24 +90,31 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     first = int(np.argmax(angles[count:] - angles[:-count])) if len(angles) > count else 0
     body = body.part(slice(first, first + count))       # in which it turns the most
 
-    def left(convention: Convention, sign: float = 1.0) -> Reals:
-        """Return the shares of readings that are not the right ones, in any unit."""
-        told, shares = undone(body, convention), [0.0]
-        for name in ('gyroscope', 'accelerations'):
-            compared = Comparison(name, [told], imu, sign * gravity)
-            if compared.motions:
-                compared.compare(0)
-                found, _, residual = compared.fit(['total', *compared.always, *OFFSETS])
-                right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1
-                            for size in compared.units.values())
-                shares.append(beyond(residual, compared.floor) if right else 1.0)
-        return np.array(shares)
+    # No convention changes how fast quaternions change, and so none the noise in rates.
+    widths = {name: compared.motions[0].width for name in ('gyroscope', 'accelerations')
+              if (compared := Comparison(name, [body], imu, gravity)).motions}
+    if not widths:
+        return ours
+
+    def left(convention: Convention, sign: float = 1.0, most: float = math.inf) -> Reals:
+        """Return the shares of readings that are not right in any unit; inf after one > most."""
+        told, shares = undone(body, convention), np.full(len(widths), math.inf)
+        for k, (name, width) in enumerate(widths.items()):
+            compared = Comparison(name, [told], imu, sign * gravity, [width])
+            compared.compare(0)
+            found, _, residual = compared.fit(['total', *compared.always, *OFFSETS])
+            right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1
+                        for size in compared.units.values())
+            shares[k] = beyond(residual, compared.floor) if right else 1.0
+            if shares[k] > most:
+                break
+        return shares
 
     before = left(ours)
     enough = min(RIGHT * float(np.max(before)), SMALL)
     if np.max(before) < WRONG or np.max(left(ours, -1.0)) < enough:
         return ours
-    after = np.array([left(one) for one in others])
+    after = np.array([left(one, most=enough) for one in others])
     # No reading may agree less.
     worst = np.where(np.any(after > 1.5 * before + 1e-3, axis=1), np.inf, np.max(after, axis=1))
     # Of equally good ones the first has the fewest parts.

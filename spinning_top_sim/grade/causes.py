@@ -162,7 +162,8 @@ class Causes:
                     'gravity', 'linear', 'motion')):
                 yield Cause([name], partial(self._term, name))
         yield Cause(['difference'], self._difference)
-        yield Cause(['gravity', *OFFSETS], self._gravity_frame)
+        yield Cause(['gravity', 'fixed gravity'], instead(
+            'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
         arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
         yield Cause([f'{arm} {k}' for k in range(3)], judged)
 
@@ -214,10 +215,10 @@ class Causes:
         if len(found) > 3 and self.kind == 'magnetometer' and np.linalg.norm(
                 found[:3] + field) < NEAR * np.linalg.norm(field):
             return None                         # the field does not turn with the IMU
+        si = next(iter(self.compared.units))
         # Where w x (w x r) is not known its mean seems to be a bias.
         coarse = self.noisy and self.kind == 'accelerations' and SURE * (
             self.compared.fit(['centripetal', *self.compared.always]).sigma[0]) > TELLS
-        si = next(iter(self.compared.units))
         return Verdict('bias' * (not coarse), f'a constant ({listed(offset)}) {si} is added',
                        float(np.linalg.norm(offset)))
 
@@ -250,12 +251,6 @@ class Causes:
             return Verdict('acceleration_scale' * (not self.noisy), text, share)
         return Verdict('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
 
-    def _gravity_frame(self, found: Reals) -> Verdict | None:
-        fixed, gravity = float(np.linalg.norm(found[-3:])), self.compared.gravity
-        there = abs(found[-4] + 1.0) <= NEAR and abs(fixed / gravity - 1.0) <= NEAR
-        text = f'gravity, {fixed:.4g} m/s^2, does not turn with the IMU'
-        return Verdict('gravity_frame', text, fixed) if there else None
-
     def _difference(self, found: Reals) -> Verdict | None:
         delay = -float(found[-1])
         return None if not 0.25 < delay < 0.8 else Verdict(
@@ -263,12 +258,12 @@ class Causes:
             'steps before, as a difference of two velocities', delay)
 
     def _arm(self, found: Reals) -> Verdict | None:
-        point, size = found[-3:] + self.compared.arm, float(np.linalg.norm(self.compared.arm))
-        share = float(point @ self.compared.arm) / (size * size or 1.0)
-        if share > NEAR and np.linalg.norm(point - share * self.compared.arm) < 0.1 * share * size:
+        arm, point = self.compared.arm, found[-3:] + self.compared.arm
+        share = float(point @ arm) / (float(arm @ arm) or 1.0)
+        if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * np.linalg.norm(point):
             return self._term('lever', np.array([share - 1.0]))
         return Verdict('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
-                       f'({listed(self.compared.arm)}) m', float(np.linalg.norm(found[-3:])))
+                       f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
 
     def _split_arm(self, found: Reals) -> Verdict | None:
         """Judge by the arms that a x r and w x (w x r) have, where none is given."""

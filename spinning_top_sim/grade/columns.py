@@ -107,7 +107,8 @@ class Comparison:
     floor: float
     noise: Mapping[str, float]
 
-    def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> None:
+    def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
+                 widths: Sequence[int] = kinematics.WIDTHS) -> None:
         self.kind, self.gravity, self.units = kind, gravity, KINDS[kind]
         self.angles = kind in ('rates', 'gyroscope')
         self.arm, self.field = (np.array(one or np.zeros(3)) for one in (imu.lever_arm, imu.field))
@@ -121,15 +122,16 @@ class Comparison:
         self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
-        share, self.motions = self._clear(stretches)
+        share, self.motions = self._clear(stretches, widths)
         self.noisy = share > NOISY or any(
             one.width > 1 or (kind == 'magnetometer' and one.noise[0] > ROUNDING)
             for one in self.motions)
 
-    def _clear(self, stretches: Sequence[Stretch]) -> tuple[float, list[Smoothed]]:
+    def _clear(self, stretches: Sequence[Stretch],
+               widths: Sequence[int]) -> tuple[float, list[Smoothed]]:
         """Return the share of noise, and the motions smoothed so that it is small."""
         best: tuple[float, list[Smoothed]] = math.inf, []
-        for width in (1,) if self.kind in ('rates', 'magnetometer') else kinematics.WIDTHS:
+        for width in (1,) if self.kind in ('rates', 'magnetometer') else widths:
             least = 4 * kinematics.margin(width)
             if min((len(one.t) for one in stretches), default=0) < least:
                 break
@@ -284,6 +286,7 @@ class Comparison:
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
             **({'linear': motion.acceleration} if np.any(motion.acceleration) else {}),
             'lever': lever, 'motion': moved, 'total': gravity + moved,
+            'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.
             'difference': along(motion.back, _per_step(along(motion.turn, moved))),
             # A lever arm that is longer by 1 m along axes of the body, and a x r alone.

@@ -41,7 +41,6 @@ from spinning_top_sim.tools.report import Finding, Mark, Report, printed
 
 START = 0.02            # angle to the start that is given, beyond which there is another [rad]
 NOISES = 5.0            # standard deviations of noise by which an attitude may be off besides
-EXACT = 1e-6            # noise of attitudes from which rates cannot tell causes [rad]
 # Errors of a device in our parameters, and faults that they are in the readings of its logs.
 DECLARED = {**{name: {'bias', 'reading_scale', 'matrix', 'inaccurate'} for name in (
                 'turn_on_bias', 'hard_iron', 'soft_iron', 'disturbance')},
@@ -124,15 +123,16 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
     """Return a report on the motion of a top beside the exact one."""
     bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
     body = max(bodies, key=lambda one: len(one.t))
-    noise, notes = body.sigma['attitudes'], []
-    tolerance = TOLERANCE + NOISES * noise
+    tolerance, notes = TOLERANCE + NOISES * body.sigma['attitudes'], []
     if run is not None:                 # its own exact motion, its moving pivot included
         first_ns = float(recorded.origin * 10 ** 9 - run.epoch_ns)
         motion = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory
         truth = motion.evaluate(np.rint(1e9 * body.t + first_ns).astype(np.int64)).quaternion
         worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
-        return Report('', _inaccurate(worst, tolerance), {'total_error_deg': Mark(
-            math.degrees(worst), math.degrees(tolerance))})
+        found = [Finding('inaccurate', f'the attitude is up to {math.degrees(worst):.3g} deg off',
+                         math.degrees(worst))] if worst > tolerance else []
+        return Report('', found, {'total_error_deg': Mark(math.degrees(worst),
+                                                          math.degrees(tolerance))})
     top = Body(**vars(parameters.top_of(values)))
     start, told = Start.of(top, parameters.start_state(values)), body.rotation.as_quat()
     body = replace(body, t=body.t - body.t[0])
@@ -143,16 +143,8 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
         notes.append('another start than the one that is given: it is read off the first samples')
         body = replace(body, t=body.t - body.t[at])
     judgement = Judgement(top, body.step, tolerance)
-    beside = judgement.beside_truth('the motion', start, body)
-    judgement.motions.append(beside)
-    found = Report('', judgement.faults, {}, notes).plus(*judgement.reports())
-    return found if noise < EXACT else replace(
-        found, found=[*judgement.faults, *_inaccurate(beside.worst, tolerance)])
-
-
-def _inaccurate(worst: float, tolerance: float) -> list[Finding]:
-    return [Finding('inaccurate', f'the attitude is up to {math.degrees(worst):.3g} deg off',
-                    math.degrees(worst))] if worst > tolerance else []
+    judgement.motions.append(judgement.beside_truth('the motion', start, body))
+    return Report('', judgement.faults, {}, notes).plus(*judgement.reports())
 
 
 main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

@@ -95,8 +95,13 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
     return Report(subject, judgement.faults, {}, notes).plus(*judgement.reports())
 
 
-def told_motion(said: Any, times: Reals) -> Stretch:
-    """Return the motion that a run has said.  Raises InvalidTrajectoryError."""
+def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Stretch:
+    """Return the motion that a run says.  Raises InvalidTrajectoryError."""
+    try:
+        said = run(body, start, times.copy(), dt)
+    except (Exception, SystemExit) as error:
+        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
+                                     f'{one_line(error)}') from error
     said = said if isinstance(said, Mapping) else {'attitudes': said}
     readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
                 for name in ('attitudes', *KINDS) if said.get(name) is not None}
@@ -147,16 +152,10 @@ class Judgement:
         """Add the motion of a scene.  Raises InvalidTrajectoryError."""
         times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
 
-        def motion_of(step: float) -> Stretch:
-            try:
-                said = run(self.body, start, times.copy(), step)
-            except (Exception, SystemExit) as error:
-                raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
-                                             f'{one_line(error)}') from error
-            return told_motion(said, times)
-
-        told = [motion_of(self.dt / divided) for divided in scene.divided]
-        if not self.motions and not np.array_equal(told[0].matrices, motion_of(self.dt).matrices):
+        told = [told_motion(run, self.body, start, times, self.dt / divided)
+                for divided in scene.divided]
+        if not self.motions and not np.array_equal(told[0].matrices, told_motion(
+                run, self.body, start, times, self.dt).matrices):
             self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
                                        'same run twice differ'))
         same = [self.beside_truth(scene.name, start, one) for one in told]
@@ -180,23 +179,21 @@ class Judgement:
             other = errors_of(told, late)
             if np.max(other[early]) < RIGHT * error and np.median(other) < RIGHT * np.median(
                     errors):
-                self._tell('late' if late > 0 else 'early', f'{name}: the attitudes are those of '
-                           f'one step {"before" if late > 0 else "after"}', float(late))
+                self.faults.append(Finding(
+                    'late' if late > 0 else 'early', f'{name}: the attitudes are those of '
+                    f'one step {"before" if late > 0 else "after"}', float(late)))
                 return Motion(name, told, float(np.max(other)))
         if error > WRONG:
             q = told.rotation.as_quat()
             found = conventions.best(q[early], solution.states_at_seconds(
                 told.t[early]).quaternion)
             if found.convention.parts and found.after < RIGHT * found.before:
-                self._tell('convention', f'{name}: attitudes are told as {found.convention.name}; '
-                           'this is undone', found.before)
+                self.faults.append(Finding(
+                    'convention', f'{name}: attitudes are told as {found.convention.name}; '
+                    'this is undone', found.before))
                 told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
                 errors = errors_of(told)
         return Motion(name, told, float(np.max(errors)))
-
-    def _tell(self, name: str, evidence: str, number: float) -> None:
-        if name not in [fault.name for fault in self.faults]:
-            self.faults.append(Finding(name, evidence, number))
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
@@ -222,18 +219,14 @@ class Judgement:
         return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
 
     def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
-        """Yield the largest error, and relative changes of the constants of the motion."""
+        """Yield the largest error, the relative change of the energy, and the order."""
         yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
                                                       math.degrees(self.tolerance))
         smoothed = Smoothed(motion.told, 1)
-        w, up = smoothed.rates, smoothed.turn[:, 2]
-        momenta = w * self.body.inertia
-        for name, values in (
-                ('energy', 0.5 * np.sum(momenta * w, axis=1)
-                 + self.body.gravity_torque * up[:, 2]),
-                ('l3', momenta[:, 2]), ('lz', np.sum(momenta * up, axis=1))):
-            yield f'{name}_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
-                values, float(values[0]))))))
+        w, up = smoothed.rates, smoothed.turn[:, 2, 2]
+        energy = 0.5 * w ** 2 @ self.body.inertia + self.body.gravity_torque * up
+        yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
+            energy, float(energy[0]))))))
         if motion.name in self.orders:
             yield f'order: {motion.name}', Mark(self.orders[motion.name])
 

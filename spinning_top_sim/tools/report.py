@@ -130,15 +130,14 @@ class Report:
 
     def as_json(self) -> str:
         """Return the report as JSON; null: NaN or infinity."""
-        def finite(value: float) -> float | None:
-            return value if math.isfinite(value) else None
+        def told(one: Finding | Mark) -> dict[str, Any]:
+            return {name: None if isinstance(value, float) and not math.isfinite(value) else value
+                    for name, value in one._asdict().items()}
 
         return json.dumps({
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-            'found': [{'name': finding.name, 'evidence': finding.evidence,
-                       'number': finite(finding.number)} for finding in self.found],
-            'marks': {name: {'value': finite(mark.value), 'limit': finite(mark.limit),
-                             'meaning': mark.meaning} for name, mark in self.marks.items()},
+            'found': [*map(told, self.found)],
+            'marks': {name: told(mark) for name, mark in self.marks.items()},
             'notes': list(self.notes)}, indent=2)
 
 
