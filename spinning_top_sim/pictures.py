@@ -125,7 +125,7 @@ def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
     return figure
 
 
-def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
+def animate(motion: Any, fps: float = 20.0, seconds: float = np.inf) -> FuncAnimation:
     """
     Return an animation of the body, its axis and the path of the tip; raises as `States.plot`.
 
@@ -135,17 +135,16 @@ def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation
         Or what has its t, rows_axis and quaternion.
     fps : float
         Frames per second, > 0; each shows the newest sample: no others are computed.
-    speed : float
-        Simulated over real time, > 0.
+    seconds : float
+        Length of the animation at most.
     """
     path, bounds = _outline(motion)
-    for name, value in (('fps', fps), ('speed', speed)):
-        if not 0.0 < value < np.inf:
-            raise ValueError(f'{name} = {value!r}: must be a number > 0')
-    times = motion.t
+    if not 0.0 < fps < np.inf:
+        raise ValueError(f'fps = {fps!r}: must be a number > 0')
+    times = motion.t - motion.t[0]
     # Each frame shows a sample: the newest one, but for rounding.
-    count = int((times[-1] - times[0]) * fps / speed + 1e-6) + 1
-    shown = np.searchsorted(times, times[0] + (np.arange(count) + 1e-6) * speed / fps, 'right') - 1
+    count = int(min(times[-1], seconds) * fps + 1e-6) + 1
+    shown = np.searchsorted(times, (np.arange(count) + 1e-6) / fps, 'right') - 1
     rim = arc(0.0, FULL_TURN, DISC, DISC_HEIGHT)
     mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), arc(-0.25, 0.25, DISC, DISC_HEIGHT)))
     figure = Figure(figsize=(4.0, 4.0), dpi=80)
@@ -160,7 +159,7 @@ def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation
             turned = attitude.rotated(tuple(motion.quaternion[now]), tuple(points.T))
             axes.fill(*project(np.stack(turned, axis=1))[:2], **style)
         draw_tip(axes, path[:now + 1])
-        axes.text(-1.05, 1.15, f't = {times[now]:.2f} s', color=INK, fontsize=9)
+        axes.text(-1.05, 1.15, f't = {motion.t[now]:.2f} s', color=INK, fontsize=9)
         return []
 
     return FuncAnimation(figure, frame, frames=count, interval=1000.0 / fps, blit=False)

@@ -31,8 +31,9 @@ def test_plot_draws_the_columns():
 
 def test_animate_shows_samples_in_time():
     motion = solve(TOP, CUSP, np.linspace(0.0, 1.0, 101))
-    html = pictures.animate(motion, fps=5.0, speed=0.5).to_jshtml()
-    assert len(re.findall(r'frames\[\d+\] = ', html)) == 11
+    for seconds, count in ((9.0, 11), (0.5, 6)):
+        html = pictures.animate(motion, fps=10.0, seconds=seconds).to_jshtml()
+        assert len(re.findall(r'frames\[\d+\] = ', html)) == count
 
 
 @pytest.mark.parametrize(('times', 'argument', 'says'), [

@@ -83,7 +83,7 @@ def test_every_channel_sends_its_fields_and_frames(number):
         if one.topic in children:
             assert message.child_frame_id == children[one.topic]
     assert deserialize_message(messages.string(frame), String).data == frame
-    message = deserialize_message(events.command(1.5, -0.25), Float64MultiArray)
+    message = deserialize_message(events.COMMAND.encode_one(0, (1.5, -0.25)), Float64MultiArray)
     (dimension,) = message.layout.dim
     assert (list(message.data), dimension.label, dimension.size) == ([1.5, -0.25], 'l3,lz', 2)
 

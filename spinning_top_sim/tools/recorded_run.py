@@ -19,7 +19,7 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import all_channels, recorded
-from spinning_top_sim.times import period_ns
+from spinning_top_sim.times import check_stamp, period_ns
 
 LAST_LOG_TIME_NS = 1 << 62  # the difference of any two log times fits into int64
 # What is computed for a log at most: for a small one, and more for each of its bytes.
@@ -53,11 +53,11 @@ class RunDescription:
     history: Sequence[Event]              # what was applied before that
     format: str                           # of the metadata, 1 in logs of 1.x
     environment: Mapping[str, str]        # version, platform and libraries
-    topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
-    commands_topic: str | None            # None where the log has none
-    events_topic: str | None
+    # Topic in the log by that of the stream, such as imu/data_raw, and of events.TOPICS
+    topics: Mapping[str, str]
     events: Sequence[Logged]              # what was applied later
     log_bytes: int                        # size of the log
+    log_end_ns: int                       # latest log time [ns]
 
     @property
     def values_in_effect(self) -> dict[str, Any]:
@@ -78,18 +78,15 @@ def read_run_description(reader: LogReader) -> RunDescription:
                                   for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [_event_before(entry) for entry in json.loads(metadata['history'])]
-        times_ns = [0, *(event.t_ns for event in history), max(begun_ns, 0)]
-        if times_ns != sorted(times_ns) or not 0 <= epoch_ns <= epoch_ns + times_ns[-1] <= min(
-                LAST_LOG_TIME_NS, reader.span[1] or LAST_LOG_TIME_NS):
-            raise ValueError('times are out of order or too late')
+        check_stamp(epoch_ns)
         environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
         topics = _topics(reader.topics, at_recording)
-        commands_topic = topics.pop(events.COMMANDS, None)
-        events_topic = topics.pop(events.EVENTS, None)
-        return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history,
-                              metadata['format'], environment, topics, commands_topic,
-                              events_topic, [*_events(reader, events_topic, epoch_ns)],
-                              reader.size)
+        journal = [topics[name] for name in topics if name == events.EVENTS]
+        return RunDescription(
+            at_start, at_recording, epoch_ns, begun_ns, history, metadata['format'], environment,
+            topics, [Logged(message.log_time, Event.decoded(message.data))
+                     for message in reader.messages(journal)],
+            reader.size, reader.span[1] or LAST_LOG_TIME_NS)
     except MALFORMED as error:
         raise ForeignLogError(
             f'its metadata {METADATA_NAME!r} or journal cannot be used: {reason_of(error)}',
@@ -99,22 +96,6 @@ def read_run_description(reader: LogReader) -> RunDescription:
 def channels_of(values: Mapping[str, Any]) -> list[Channel]:
     """Return every channel of a run that begins with these parameters."""
     return all_channels(values, Imu(values, period_ns(values['imu.rate'])))
-
-
-def _events(reader: LogReader, topic: str | None, epoch_ns: int) -> Iterator[Logged]:
-    """Yield the events in a topic.  Raises one of MALFORMED for what is none."""
-    reached_ns = epoch_ns - 1
-    for message in reader.messages(topics=[] if topic is None else [topic]):
-        event = Event.decoded(message.data)
-        sent_ns = epoch_ns + event.sent_ns
-        new_epoch_ns = event.details.get('epoch_ns', epoch_ns)
-        if not reached_ns <= sent_ns <= message.log_time <= LAST_LOG_TIME_NS or not (
-                0 <= new_epoch_ns <= message.log_time):
-            raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
-        reached_ns = max(sent_ns, new_epoch_ns - 1) if event.kind == 'reset' else (
-            new_epoch_ns + event.sent_ns)
-        epoch_ns = new_epoch_ns
-        yield Logged(message.log_time, event)
 
 
 def _event_before(entry: Mapping[str, Any] | Sequence[Any]) -> Event:
@@ -140,11 +121,6 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
             if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
 
-def most_samples(run: RunDescription) -> int:
-    """Return how many samples a run that fits into the log has at most."""
-    return LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
-
-
 def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
           ) -> Iterator[tuple[Simulation, Logged | Block]]:
     """
@@ -158,13 +134,15 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     """
     simulation = Simulation(parameters.checked(run.values_at_start), run.epoch_ns)
     most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
-    samples_left = most_samples(run)
+    samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
 
-    def play(t_ns: int, *, with_messages: bool) -> Iterator[tuple[Simulation, Block]]:
+    def play(t_ns: int, *, recorded: bool) -> Iterator[tuple[Simulation, Block]]:
         """Yield the blocks up to a time, as far as the equations and the limits go."""
         nonlocal samples_left
+        if not simulation.now_ns <= t_ns <= run.log_end_ns - simulation.epoch_ns:
+            raise ValueError(f't = {t_ns} ns: out of order, or behind the end of the log')
         channels = [channel for channel in simulation.channels
-                    if with_messages and channel.topic in run.topics]
+                    if recorded and samples and channel.topic in run.topics]
         samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in channels)
         if samples_left < 0:
             raise ValueError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
@@ -177,9 +155,9 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
         simulation.now_ns = t_ns
 
     for event in run.history:               # before the recording
-        yield from play(event.t_ns, with_messages=False)
+        yield from play(event.t_ns, recorded=False)
         _apply(simulation, event)
-    yield from play(run.begun_ns, with_messages=False)
+    yield from play(run.begun_ns, recorded=False)
     simulation.apply('parameters', **{
         name: run.values_at_recording[name] for name in parameters.AT_ONCE})
     yield simulation, Logged(run.epoch_ns, Event('start', 0, simulation.now_ns))
@@ -187,10 +165,10 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
         event = logged.event
         if event.kind != 'start' and (event.kind != 'parameters'
                                       or not parameters.AT_ONCE.isdisjoint(event.details)):
-            yield from play(event.sent_ns, with_messages=samples)
+            yield from play(event.sent_ns, recorded=True)
             _apply(simulation, event)
             yield simulation, logged
-    yield from play(end_ns - simulation.epoch_ns, with_messages=samples)
+    yield from play(max(end_ns - simulation.epoch_ns, simulation.now_ns), recorded=True)
 
 
 def _apply(simulation: Simulation, event: Event) -> None:
