@@ -24,10 +24,8 @@ FULL_TURN = 2.0 * np.pi
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
 # Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73')
-STYLE: dict[Any, Any] = {
-    'axes.labelsize': 9, 'axes.spines.right': False, 'axes.spines.top': False,
-    'axes.titlesize': 11, 'axes.xmargin': 0.0, 'lines.linewidth': 1.2, 'text.color': INK,
-    'xtick.labelsize': 8, 'ytick.labelsize': 8}
+STYLE: dict[Any, Any] = {'axes.spines.right': False, 'axes.spines.top': False,
+                         'axes.xmargin': 0.0, 'font.size': 9.0, 'lines.linewidth': 1.2}
 LEAST_DRIFT = 1e-12         # that an axis shows
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
 
@@ -93,22 +91,12 @@ def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
     path, bounds = _outline(motion)
     with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 7.0), layout='constrained')
-        panels = figure.subplot_mosaic(
-            [['sphere', 'above'], ['theta', 'rate'], ['drift', 'drift']],
-            height_ratios=(2.2, 1.0, 0.8))
+        panels = figure.subplot_mosaic([['sphere', 'theta'], ['sphere', 'rate'],
+                                        ['sphere', 'drift']])
         draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
         draw_tip(panels['sphere'], path)
         panels['sphere'].set_title('path of the axis on the unit sphere')
-        above = panels['above']
-        for theta in bounds:
-            above.plot(*arc(0.0, FULL_TURN, np.sin(theta), 0.0).T[:2], color=FAINT, linewidth=0.8)
-        above.plot(path[:, 0], path[:, 1], color=PATH)
-        above.set(title='the same from above', aspect='equal')
-        above.axis('off')
         panels['theta'].plot(motion.t, np.degrees(motion.theta_folded), color=COLOURS[0])
-        for theta in bounds:
-            panels['theta'].axhline(float(np.degrees(theta)), color=INK, linewidth=0.8,
-                                    linestyle=':')
         panels['theta'].set(title='nutation', ylabel='tilt θ [deg]', xlabel='t [s]')
         panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
         panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)

@@ -22,9 +22,9 @@ def test_plot_draws_the_columns():
             ('relative drift [1]', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
         line = panels[label].lines[0]
         assert (line.get_xdata() == motion.t).all() and (line.get_ydata() == expected).all()
-    path = panels['the same from above'].lines[-1]
-    assert (np.hypot(path.get_xdata(), path.get_ydata())
-            == pytest.approx(np.sin(motion.theta), abs=1e-12))
+    path = panels['path of the axis on the unit sphere'].lines[-2]
+    assert (path.get_xdata()[1], path.get_ydata()[1]) == pytest.approx(
+        [part[0] for part in pictures.project(np.stack(motion.rows_axis, axis=1)[-1:])[:2]])
     # The rounding noise of an exact motion is no curve.
     assert panels['relative drift [1]'].get_ylim() == (-1e-12, 1e-12)
 

@@ -63,10 +63,14 @@ def _run(arguments: argparse.Namespace) -> int:
             run = read_run_description(reader)
         except ForeignLogError as error:
             foreign = str(error)
-        found = Survey(reader, run, foreign)
-        refused = foreign if run is None else objection(run)
-        if run is not None:
-            if arguments.verify and not refused:
+        for option, reason in (('verify', foreign or objection(run)), ('export', foreign)):
+            if reason and getattr(arguments, option):
+                raise LogError(f'--{option}: {reason}')
+        found = Survey(reader, run)
+        if run is None:
+            found.notes.append(foreign)
+        else:
+            if arguments.verify:
                 with cli.progress('verified', (found.last_ns - found.begin_ns) / NANOSECONDS, 's',
                                   quiet=arguments.json) as show:
                     found.verify = compare(run, reader, found.last_ns, lambda stamp_ns: show(
@@ -82,9 +86,6 @@ def _run(arguments: argparse.Namespace) -> int:
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    for option, reason in (('verify', refused), ('export', foreign)):
-        if reason and getattr(arguments, option):
-            raise LogError(f'--{option}: {reason}')
     _draw(arguments, found)
     passed = found.whole and (found.verify is None or found.verify.identical)
     return cli.OK if passed else cli.FAILED
@@ -119,17 +120,15 @@ def _as_text(found: Survey) -> Iterator[str]:
     state = 'whole' if found.whole else 'truncated' if found.damage.torn else 'damaged'
     yield f'{found.file}: {state}, {(found.end_ns - found.begin_ns) / NANOSECONDS:.6g} s'
     yield from found.damage.lines()
-    if found.run is None:
-        yield found.why_not_ours
-    else:
+    if found.run is not None:
         values, counts = found.run.values_at_start, Counter(
             event.kind for _, event in found.run.events)
         yield (f'spinning_top_sim {found.run.environment["version"]}, '
                f'{values["solver.method"]}, seed {values["seed"]}')
         yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
                f'{counts["parameters"]} changes of parameters')
-    yield from _topics(found.topics)
     yield from found.notes
+    yield from _topics(found.topics)
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, found.begin_ns)
     if found.verify is not None:

@@ -37,7 +37,6 @@ class Topic:
     """The findings about a topic."""
 
     type: str
-    stream: str | None = None
     count: int = 0
     rate: float | None = None                       # [Hz]
     longest_gap_ns: tuple[int, int] | None = None   # from one message to the next
@@ -99,18 +98,16 @@ class Survey:
     begin_ns: int
     end_ns: int
     topics: dict[str, Topic]
-    why_not_ours: str
     run: RunDescription | None
     motions: list[Motion]
     notes: list[str]
     verify: Comparison | None
 
-    def __init__(self, reader: LogReader, run: RunDescription | None, why_not_ours: str) -> None:
+    def __init__(self, reader: LogReader, run: RunDescription | None) -> None:
         self.file, self.whole, self.damage = str(reader.path), reader.whole, reader.damage
         self.begin_ns, self.end_ns = reader.span
         self.topics = {topic.name: Topic(topic.type_name) for topic in reader.topics}
-        self.why_not_ours, self.run, self.verify = why_not_ours, run, None
-        self.motions, self.notes, self.last_ns = [], [], 0
+        self.run, self.verify, self.motions, self.notes, self.last_ns = run, None, [], [], 0
         self.shown: list[SampledStates] = []
         self._courses: list[_Course] = []
         with np.errstate(all='ignore'):         # a log may hold any numbers
@@ -122,8 +119,6 @@ class Survey:
 
     def _follow(self, run: RunDescription) -> None:
         """Compute the motions of a run."""
-        for name, topic in run.topics.items():
-            self.topics[topic].stream = name
         motions = self.motions
         try:
             for simulation, done in recorded_run.rerun(run, self.end_ns):
@@ -151,6 +146,8 @@ class Survey:
     def _read(self, reader: LogReader) -> None:
         """Count the messages, and keep the samples of the source with their motions."""
         ends_ns = [motion.end_ns for motion in self.motions[:-1]]
+        sampled = {topic for stream, topic in (self.run.topics if self.run else {}).items()
+                   if stream not in events.TOPICS}
         blocks_ns = {topic: [np.empty(0, np.int64)] for topic in self.topics}
         for topic, messages in reader.groups():
             blocks_ns[topic].append(_stamps(messages))
@@ -166,7 +163,7 @@ class Survey:
                 longest, length_ns = int(np.argmax(np.diff(stamps_ns))), int(np.ptp(stamps_ns))
                 found.longest_gap_ns = int(stamps_ns[longest]), int(stamps_ns[longest + 1])
                 found.rate = (found.count - 1) / length_ns * NANOSECONDS if length_ns else None
-            if found.count and found.stream and found.stream not in events.TOPICS:
+            if found.count and name in sampled:
                 self.last_ns = max(self.last_ns, int(stamps_ns[-1]))
         if self.motions:        # the last event may be later than the last sample
             self.motions[-1].end_ns = max(self.motions[-1].begin_ns, self.last_ns)

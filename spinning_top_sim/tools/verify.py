@@ -52,9 +52,9 @@ class Comparison:
         self.first = self.first or f'{topic} at {stamp_text(stamp_ns)} s: {found}'
 
 
-def objection(run: RunDescription) -> str:
+def objection(run: RunDescription | None) -> str:
     """Return why the run of a log cannot be verified by this version, '' if it can."""
-    return '' if run.format == provenance.FORMAT else (
+    return '' if run is None or run.format == provenance.FORMAT else (
         f'it was recorded by spinning_top_sim {run.environment["version"]}, which draws other '
         'noise and computes other last bits: verify it with that version')
 
