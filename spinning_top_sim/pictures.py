@@ -96,20 +96,19 @@ def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
         draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
         draw_tip(panels['sphere'], path)
         panels['sphere'].set_title('path of the axis on the unit sphere')
-        panels['theta'].plot(motion.t, np.degrees(motion.theta_folded), color=COLOURS[0])
-        panels['theta'].set(title='nutation', ylabel='tilt θ [deg]', xlabel='t [s]')
-        panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
-        panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
-        panels['rate'].set(title='precession', ylabel="rate φ' [rad/s]", xlabel='t [s]')
-        panels['drift'].plot(motion.t, drift, color=COLOURS[2])
+        for name, title, label, values, color in (
+                ('theta', 'nutation', 'tilt θ [deg]', np.degrees(motion.theta_folded), COLOURS[0]),
+                ('rate', 'precession', "rate φ' [rad/s]", motion.phi_dot, COLOURS[1]),
+                ('drift', 'energy', 'relative drift [1]', drift, COLOURS[2])):
+            panels[name].plot(motion.t, values, color=color)
+            panels[name].set(title=title, ylabel=label, xlabel='t [s]')
+            for begin in begins:
+                panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
         # Of an exact motion it is rounding noise.
         reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
                                                     where=np.isfinite(drift))))
-        panels['drift'].set(title='energy', ylabel='relative drift [1]', xlabel='t [s]',
-                            ylim=(-reach, reach))
-        for name in ('theta', 'rate', 'drift'):
-            for begin in begins:
-                panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
+        panels['drift'].set_ylim(-reach, reach)
+        panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
     return figure
 
 

@@ -148,7 +148,7 @@ def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
     path = rewritten(short, tmp_path / 'odd.mcap', metadata={key: text})
     code, out, err = told(capsys, path, '--verify')
     assert code == 1 and '\n' not in err[:-1]
-    assert 'cannot be used' in err or '/pose' in out and 'verify: the run cannot be' in out
+    assert 'cannot be used' in err or ('/pose' in out and 'verify: the run cannot be' in out)
 
 
 def test_pictures_are_drawn(short, tmp_path, capsys):

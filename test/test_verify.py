@@ -163,16 +163,16 @@ def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
 def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
         short, tmp_path, capsys, monkeypatch):
     """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
-    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
-    monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
+    monkeypatch.setattr(recorded_run, 'WORK_A_BYTE', 0)         # they would take a minute
+    monkeypatch.setattr(recorded_run, 'LEAST_WORK', 5_000)
     path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
         4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
-    assert code == 1 and 'lacks most samples of this run' in out
+    assert code == 1 and 'verify: the run cannot be computed again: ValueError: over 5000' in out
     t_ns = 3_999_999_998_000_000_000
     far = Event('command', t_ns, t_ns, {'l3': 1.7, 'lz': 1.4}).entries()[0][1]
     path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
         far if topic.endswith('/events') and number == 1 else data),
         stamp=lambda topic, number, stamp_ns: (
             4 * 10 ** 18 if topic.endswith('/events') and number == 1 else stamp_ns))
-    assert 'integration steps are too many' in told(capsys, path)[1]
+    assert 'over 5000 samples or integration steps are too many' in told(capsys, path)[1]

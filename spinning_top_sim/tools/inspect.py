@@ -18,7 +18,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, fields
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
@@ -71,16 +71,14 @@ def _run(arguments: argparse.Namespace) -> int:
             found.notes.append(foreign)
         else:
             if arguments.verify:
-                with cli.progress('verified', (found.last_ns - found.begin_ns) / NANOSECONDS, 's',
-                                  quiet=arguments.json) as show:
-                    found.verify = compare(run, reader, found.last_ns, lambda stamp_ns: show(
-                        (stamp_ns - found.begin_ns) / NANOSECONDS))
+                found.verify = compare(run, reader, found.last_ns)
             exported += log_exports.write(reader, run, arguments.export)
     if arguments.json:
         with cli.reader_may_end():
+            text = json.dumps(found, default=lambda one: {
+                name: value for name, value in vars(one).items() if not name.startswith('_')})
             # Numbers that JSON does not have become null.
-            print(json.dumps(json.loads(json.dumps(asdict(found)),
-                                        parse_constant=lambda name: None), indent=2))
+            print(json.dumps(json.loads(text, parse_constant=lambda name: None), indent=2))
     else:
         for line in _as_text(found):
             cli.print_line(line)

@@ -22,9 +22,8 @@ from spinning_top_sim.streams.topics import all_channels, recorded
 from spinning_top_sim.times import check_stamp, period_ns
 
 LAST_LOG_TIME_NS = 1 << 62  # the difference of any two log times fits into int64
-# What is computed for a log at most: for a small one, and more for each of its bytes.
-LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
-LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
+# Samples and integration steps of a log at most: of a small one, and more for each of its bytes.
+LEAST_WORK, WORK_A_BYTE = 200_000, 20
 # In logs of 1.x events before the recording are lists of numbers: the time, and these.
 LISTS_OF_1 = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State)),
               'parameters': ('imu.rate',), 'drive': ('x', 'y', 'z', 'stop_ns')}
@@ -133,25 +132,25 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     it takes far more work than a run that fits into the log.
     """
     simulation = Simulation(parameters.checked(run.values_at_start), run.epoch_ns)
-    most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
-    samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
+    limit, count = LEAST_WORK + WORK_A_BYTE * run.log_bytes, 0
+    too_much = ValueError(f'over {limit} samples or integration steps are too many for a log of '
+                          f'{run.log_bytes} bytes')
 
     def play(t_ns: int, *, recorded: bool) -> Iterator[tuple[Simulation, Block]]:
-        """Yield the blocks up to a time, as far as the equations and the limits go."""
-        nonlocal samples_left
+        """Yield the blocks up to a time, as far as the equations and the limit go."""
+        nonlocal count
         if not simulation.now_ns <= t_ns <= run.log_end_ns - simulation.epoch_ns:
             raise ValueError(f't = {t_ns} ns: out of order, or behind the end of the log')
         channels = [channel for channel in simulation.channels
                     if recorded and samples and channel.topic in run.topics]
-        samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in channels)
-        if samples_left < 0:
-            raise ValueError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
+        count += sum(len(one.times(simulation.now_ns, t_ns)) for one in channels)
+        if count > limit:
+            raise too_much
         with contextlib.suppress(IntegrationError):
             for block in simulation.play(channels, t_ns):
                 yield simulation, block
-                if simulation.trajectory.steps > most_steps:
-                    raise ValueError(f'over {most_steps} integration steps are too many for a log '
-                                     f'of {run.log_bytes} bytes')
+                if simulation.trajectory.steps > limit:
+                    raise too_much
         simulation.now_ns = t_ns
 
     for event in run.history:               # before the recording

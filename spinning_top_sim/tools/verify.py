@@ -3,7 +3,7 @@
 
 import itertools
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from spinning_top_sim.recording import provenance
@@ -59,13 +59,11 @@ def objection(run: RunDescription | None) -> str:
         'noise and computes other last bits: verify it with that version')
 
 
-def compare(run: RunDescription, reader: LogReader, end_ns: int,
-            show: Callable[[int], None]) -> Comparison:
+def compare(run: RunDescription, reader: LogReader, end_ns: int) -> Comparison:
     """
     Compute the run of a log while the log is read in the order of time; return the result.
 
     end_ns : log time up to which they are compared [ns]
-    show : takes the log time that is reached [ns]
     """
     topics = [topic for name, topic in run.topics.items() if name != events.EVENTS]
     result = Comparison(dict.fromkeys(topics, 0), warnings=[
@@ -81,7 +79,6 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
         for key in sorted(key for key in waiting if key[0] < before_ns):
             for logged, computed in itertools.zip_longest(*waiting.pop(key)):
                 result.add(*key, logged, computed)
-        show(min(before_ns, end_ns))
     result.identical = not (result.first or result.stopped)
     return result
 
