@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 from helpers.inspected import as_json, log_of, rewritten, told
 from helpers.reference import ROOT, SCENES
+from helpers.simulations import SECOND
 from mcap.writer import Writer
 
+from spinning_top_sim.streams.events import Event
 from spinning_top_sim.tools import inspect, recover, simulate
 
 # The tilt rests, or nearly: there is no nutation in the data.
@@ -42,6 +44,17 @@ def test_every_scene_is_measured_from_its_data(tmp_path, capsys, scene):
         truth['mean_precession_rate'], rel=1e-9, abs=1e-9 if scene == 'free_top' else 0.0)
     assert measured['mean_spin_rate'] == pytest.approx(truth['mean_spin_rate'], rel=1e-9)
     assert not measured['missing']
+
+
+def test_a_motion_ends_where_its_stamps_jump(short, tmp_path, capsys):
+    event = Event('epoch', 400_000_000, 400_000_000, {'epoch_ns': 3_000_000_000}).entries()[0][1]
+    path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
+        [data, event] if topic.endswith('/events') and number == 1 else data),
+        stamp=lambda topic, number, stamp_ns: stamp_ns + 2 * SECOND * (
+            stamp_ns > 1_400_000_000 or (topic.endswith('/events') and number == 1)))
+    _, content = as_json(capsys, path)
+    assert [motion['cause'] for motion in content['motions']] == ['start', 'command', 'epoch']
+    assert max(motion['orientation_error'] for motion in content['motions']) < 1e-9
 
 
 @pytest.mark.parametrize('topic', ['pose', 'ground_truth_imu', 'ground_truth_odom'])
