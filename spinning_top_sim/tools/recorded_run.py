@@ -139,7 +139,8 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     def play(t_ns: int, *, recorded: bool) -> Iterator[tuple[Simulation, Block]]:
         """Yield the blocks up to a time, as far as the equations and the limit go."""
         nonlocal count
-        if not simulation.now_ns <= t_ns <= run.log_end_ns - simulation.epoch_ns:
+        # An event before the first sample has the time 0, and what is sent then the time -1.
+        if not max(simulation.now_ns, 0) <= max(t_ns, 0) <= run.log_end_ns - simulation.epoch_ns:
             raise ValueError(f't = {t_ns} ns: out of order, or behind the end of the log')
         channels = [channel for channel in simulation.channels
                     if recorded and samples and channel.topic in run.topics]
