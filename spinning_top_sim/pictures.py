@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.animation import FuncAnimation
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -24,8 +23,6 @@ FULL_TURN = 2.0 * np.pi
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
 # Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73')
-STYLE: dict[Any, Any] = {'axes.spines.right': False, 'axes.spines.top': False,
-                         'axes.xmargin': 0.0, 'font.size': 9.0, 'lines.linewidth': 1.2}
 LEAST_DRIFT = 1e-12         # that an axis shows
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
 
@@ -89,26 +86,24 @@ def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
     begins : times at which other motions begin [s]
     """
     path, bounds = _outline(motion)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 7.0), layout='constrained')
-        panels = figure.subplot_mosaic([['sphere', 'theta'], ['sphere', 'rate'],
-                                        ['sphere', 'drift']])
-        draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
-        draw_tip(panels['sphere'], path)
-        panels['sphere'].set_title('path of the axis on the unit sphere')
-        for name, title, label, values, color in (
-                ('theta', 'nutation', 'tilt θ [deg]', np.degrees(motion.theta_folded), COLOURS[0]),
-                ('rate', 'precession', "rate φ' [rad/s]", motion.phi_dot, COLOURS[1]),
-                ('drift', 'energy', 'relative drift [1]', drift, COLOURS[2])):
-            panels[name].plot(motion.t, values, color=color)
-            panels[name].set(title=title, ylabel=label, xlabel='t [s]')
-            for begin in begins:
-                panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
-        # Of an exact motion it is rounding noise.
-        reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
-                                                    where=np.isfinite(drift))))
-        panels['drift'].set_ylim(-reach, reach)
-        panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
+    figure = Figure(figsize=(10.0, 7.0), layout='constrained')
+    panels = figure.subplot_mosaic([['sphere', 'theta'], ['sphere', 'rate'], ['sphere', 'drift']])
+    draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
+    draw_tip(panels['sphere'], path)
+    panels['sphere'].set_title('path of the axis on the unit sphere')
+    for name, title, label, values, color in (
+            ('theta', 'nutation', 'tilt θ [deg]', np.degrees(motion.theta_folded), COLOURS[0]),
+            ('rate', 'precession', "rate φ' [rad/s]", motion.phi_dot, COLOURS[1]),
+            ('drift', 'energy', 'relative drift [1]', drift, COLOURS[2])):
+        panels[name].plot(motion.t, values, color=color)
+        panels[name].set(title=title, ylabel=label, xlabel='t [s]')
+        for begin in begins:
+            panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
+    # Of an exact motion it is rounding noise.
+    reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
+                                                where=np.isfinite(drift))))
+    panels['drift'].set_ylim(-reach, reach)
+    panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
     return figure
 
 

@@ -154,11 +154,11 @@ def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
 
 
 def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
-        short, tmp_path, capsys, monkeypatch):
+        short, columns, tmp_path, capsys, monkeypatch):
     """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
     monkeypatch.setattr(recorded_run, 'WORK_A_BYTE', 0)         # they would take a minute
     monkeypatch.setattr(recorded_run, 'LEAST_WORK', 5_000)
-    path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
+    path = rewritten(columns, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
         4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'verify: the run cannot be computed again: ValueError: over 5000' in out

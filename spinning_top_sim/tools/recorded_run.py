@@ -16,7 +16,6 @@ from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import all_channels, recorded
 from spinning_top_sim.times import check_stamp, period_ns
@@ -61,9 +60,12 @@ class RunDescription:
     @property
     def values_in_effect(self) -> dict[str, Any]:
         """The parameters of the first sample: a change that waits for a reset is not in it."""
-        return {parameter.name: (
-            self.values_at_start if parameter.effect is Effect.RESET
-            else self.values_at_recording)[parameter.name] for parameter in parameters.TABLE}
+        return {**self.values_at_start, **self.changes_at_once}
+
+    @property
+    def changes_at_once(self) -> dict[str, Any]:
+        """The parameters whose changes take effect at once, at the begin of the recording."""
+        return {name: self.values_at_recording[name] for name in parameters.AT_ONCE}
 
 
 def read_run_description(reader: LogReader) -> RunDescription:
@@ -158,8 +160,7 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
         yield from play(event.t_ns, recorded=False)
         simulation.apply(event.kind, **event.details)
     yield from play(run.begun_ns, recorded=False)
-    simulation.apply('parameters', **{
-        name: run.values_at_recording[name] for name in parameters.AT_ONCE})
+    simulation.apply('parameters', **run.changes_at_once)
     yield simulation, Logged(run.epoch_ns, Event('start', 0, simulation.now_ns))
     for logged in run.events:
         event = logged.event
