@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.animation import FuncAnimation
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -24,10 +23,6 @@ FULL_TURN = 2.0 * np.pi
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
 # Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73')
-STYLE: dict[Any, Any] = {
-    'axes.labelsize': 9, 'axes.spines.right': False, 'axes.spines.top': False,
-    'axes.titlesize': 11, 'axes.xmargin': 0.0, 'lines.linewidth': 1.2, 'text.color': INK,
-    'xtick.labelsize': 8, 'ytick.labelsize': 8}
 LEAST_DRIFT = 1e-12         # that an axis shows
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
 
@@ -91,41 +86,28 @@ def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
     begins : times at which other motions begin [s]
     """
     path, bounds = _outline(motion)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 7.0), layout='constrained')
-        panels = figure.subplot_mosaic(
-            [['sphere', 'above'], ['theta', 'rate'], ['drift', 'drift']],
-            height_ratios=(2.2, 1.0, 0.8))
-        draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
-        draw_tip(panels['sphere'], path)
-        panels['sphere'].set_title('path of the axis on the unit sphere')
-        above = panels['above']
-        for theta in bounds:
-            above.plot(*arc(0.0, FULL_TURN, np.sin(theta), 0.0).T[:2], color=FAINT, linewidth=0.8)
-        above.plot(path[:, 0], path[:, 1], color=PATH)
-        above.set(title='the same from above', aspect='equal')
-        above.axis('off')
-        panels['theta'].plot(motion.t, np.degrees(motion.theta_folded), color=COLOURS[0])
-        for theta in bounds:
-            panels['theta'].axhline(float(np.degrees(theta)), color=INK, linewidth=0.8,
-                                    linestyle=':')
-        panels['theta'].set(title='nutation', ylabel='tilt θ [deg]', xlabel='t [s]')
-        panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
-        panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
-        panels['rate'].set(title='precession', ylabel="rate φ' [rad/s]", xlabel='t [s]')
-        panels['drift'].plot(motion.t, drift, color=COLOURS[2])
-        # Of an exact motion it is rounding noise.
-        reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
-                                                    where=np.isfinite(drift))))
-        panels['drift'].set(title='energy', ylabel='relative drift [1]', xlabel='t [s]',
-                            ylim=(-reach, reach))
-        for name in ('theta', 'rate', 'drift'):
-            for begin in begins:
-                panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
+    figure = Figure(figsize=(10.0, 7.0), layout='constrained')
+    panels = figure.subplot_mosaic([['sphere', 'theta'], ['sphere', 'rate'], ['sphere', 'drift']])
+    draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
+    draw_tip(panels['sphere'], path)
+    panels['sphere'].set_title('path of the axis on the unit sphere')
+    for name, title, label, values, color in (
+            ('theta', 'nutation', 'tilt θ [deg]', np.degrees(motion.theta_folded), COLOURS[0]),
+            ('rate', 'precession', "rate φ' [rad/s]", motion.phi_dot, COLOURS[1]),
+            ('drift', 'energy', 'relative drift [1]', drift, COLOURS[2])):
+        panels[name].plot(motion.t, values, color=color)
+        panels[name].set(title=title, ylabel=label, xlabel='t [s]')
+        for begin in begins:
+            panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
+    # Of an exact motion it is rounding noise.
+    reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
+                                                where=np.isfinite(drift))))
+    panels['drift'].set_ylim(-reach, reach)
+    panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
     return figure
 
 
-def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
+def animate(motion: Any, fps: float = 20.0, seconds: float = np.inf) -> FuncAnimation:
     """
     Return an animation of the body, its axis and the path of the tip; raises as `States.plot`.
 
@@ -135,17 +117,16 @@ def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation
         Or what has its t, rows_axis and quaternion.
     fps : float
         Frames per second, > 0; each shows the newest sample: no others are computed.
-    speed : float
-        Simulated over real time, > 0.
+    seconds : float
+        Length of the animation at most.
     """
     path, bounds = _outline(motion)
-    for name, value in (('fps', fps), ('speed', speed)):
-        if not 0.0 < value < np.inf:
-            raise ValueError(f'{name} = {value!r}: must be a number > 0')
-    times = motion.t
+    if not 0.0 < fps < np.inf:
+        raise ValueError(f'fps = {fps!r}: must be a number > 0')
+    times = motion.t - motion.t[0]
     # Each frame shows a sample: the newest one, but for rounding.
-    count = int((times[-1] - times[0]) * fps / speed + 1e-6) + 1
-    shown = np.searchsorted(times, times[0] + (np.arange(count) + 1e-6) * speed / fps, 'right') - 1
+    count = int(min(times[-1], seconds) * fps + 1e-6) + 1
+    shown = np.searchsorted(times, (np.arange(count) + 1e-6) / fps, 'right') - 1
     rim = arc(0.0, FULL_TURN, DISC, DISC_HEIGHT)
     mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), arc(-0.25, 0.25, DISC, DISC_HEIGHT)))
     figure = Figure(figsize=(4.0, 4.0), dpi=80)
@@ -160,7 +141,7 @@ def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation
             turned = attitude.rotated(tuple(motion.quaternion[now]), tuple(points.T))
             axes.fill(*project(np.stack(turned, axis=1))[:2], **style)
         draw_tip(axes, path[:now + 1])
-        axes.text(-1.05, 1.15, f't = {times[now]:.2f} s', color=INK, fontsize=9)
+        axes.text(-1.05, 1.15, f't = {motion.t[now]:.2f} s', color=INK, fontsize=9)
         return []
 
     return FuncAnimation(figure, frame, frames=count, interval=1000.0 / fps, blit=False)

@@ -22,17 +22,20 @@ def test_plot_draws_the_columns():
             ('relative drift [1]', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
         line = panels[label].lines[0]
         assert (line.get_xdata() == motion.t).all() and (line.get_ydata() == expected).all()
-    path = panels['the same from above'].lines[-1]
-    assert (np.hypot(path.get_xdata(), path.get_ydata())
-            == pytest.approx(np.sin(motion.theta), abs=1e-12))
+    path = panels['path of the axis on the unit sphere'].lines[-2]
+    assert (path.get_xdata()[1], path.get_ydata()[1]) == pytest.approx(
+        [part[0] for part in pictures.project(np.stack(motion.rows_axis, axis=1)[-1:])[:2]])
+    assert np.ravel(pictures.project(np.eye(3)[2:])) == pytest.approx(
+        [0.0, 0.5 ** 0.5, 0.5 ** 0.5], abs=1e-15)
     # The rounding noise of an exact motion is no curve.
     assert panels['relative drift [1]'].get_ylim() == (-1e-12, 1e-12)
 
 
 def test_animate_shows_samples_in_time():
     motion = solve(TOP, CUSP, np.linspace(0.0, 1.0, 101))
-    html = pictures.animate(motion, fps=5.0, speed=0.5).to_jshtml()
-    assert len(re.findall(r'frames\[\d+\] = ', html)) == 11
+    for seconds, count in ((9.0, 11), (0.5, 6)):
+        html = pictures.animate(motion, fps=10.0, seconds=seconds).to_jshtml()
+        assert len(re.findall(r'frames\[\d+\] = ', html)) == count
 
 
 @pytest.mark.parametrize(('times', 'argument', 'says'), [

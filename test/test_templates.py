@@ -73,7 +73,7 @@ def test_every_channel_sends_its_fields_and_frames(number):
         if one.topic in children:
             assert message.child_frame_id == children[one.topic]
     assert read(messages.string(frame), 'std_msgs/msg/String').data == frame
-    message = read(events.command(1.5, -0.25), ARRAY)
+    message = read(events.COMMAND.encode_one(0, (1.5, -0.25)), ARRAY)
     (dimension,) = message.layout.dim
     assert (list(message.data), dimension.label, dimension.size) == ([1.5, -0.25], 'l3,lz', 2)
 

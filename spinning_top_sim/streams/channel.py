@@ -181,7 +181,3 @@ class Channel:
         due_ns = samples.t_ns + self.delay_ns
         return (due_ns, rows) if self.faults is None else (
             np.repeat(due_ns, copies), np.repeat(rows, copies, axis=0))
-
-    def due(self, t_ns: Times) -> Times:
-        """Return when the messages of samples at times (n,) are due [ns]."""
-        return np.repeat(t_ns + self.delay_ns, self.faults(t_ns)[1] if self.faults else 1)

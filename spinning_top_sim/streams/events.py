@@ -17,6 +17,7 @@ from spinning_top_sim.streams import messages, parameters
 COMMANDS, EVENTS = '~/commands', '~/events'
 # Topics and types, recorded behind the channels, in this order.
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
+COMMAND = messages.float64_multi_array(('l3', 'lz'))        # an applied one, as it is logged
 # What an event of each kind has besides its times, and how that is read.
 MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
 CHANGES = (*MOTIONS, 'parameters', 'epoch', 'reset')        # all but the start of a recording
@@ -89,10 +90,6 @@ class Event:
         """Return what is logged of the event: topics and messages; std_msgs/String of JSON."""
         logged = [(EVENTS, messages.string(json.dumps(self.as_mapping(), default=list)))]
         if self.kind == 'command':
-            logged.append((COMMANDS, command(**self.details)))
+            logged.append((COMMANDS, COMMAND.encode_one(
+                0, (self.details['l3'], self.details['lz']))))
         return logged
-
-
-def command(l3: float, lz: float) -> bytes:
-    """Return an applied command as it is logged: std_msgs/Float64MultiArray [L3, Lz]."""
-    return messages.float64_multi_array(('l3', 'lz')).encode_one(0, (l3, lz))

@@ -51,20 +51,14 @@ class SampledStates(States):
         self.lz = top.lambda1 * across + self._l3 * height
         with np.errstate(divide='ignore', invalid='ignore'):        # at a pole
             self.phi_dot = across / (up_1 ** 2 + up_2 ** 2)
-        self._rows = rows
-
-    def until(self, seconds: float) -> SampledStates:
-        """Return the states of so many seconds from the first one on, but two at least."""
-        count = max(2, int(np.searchsorted(self.t, self.t[0] + seconds, 'right')))
-        return SampledStates(self.top, self.t[:count], self._rows[:, :count])
 
 
 def attitudes_of(name: str, imu: Imu, stamps_ns: Times, fields: tuple[NDArray[np.float64], ...],
-                 ) -> tuple[Times, NDArray[np.float64]] | None:
-    """Return stamps (n,) and samples (WIDTH, n) in the decoded fields of a stream, if it has."""
+                 ) -> tuple[Times, NDArray[np.float64]]:
+    """Return stamps (n,) and samples (WIDTH, n) in the decoded fields of a stream."""
     parts = [field.T for field in fields]
     rows = np.full((WIDTH, len(stamps_ns)), np.nan)
-    if name in ('ground_truth/imu', 'imu/data'):
+    if name == 'ground_truth/imu':
         rows[QUATERNION], rates = imu.mounting.to_body(tuple(parts[0]), tuple(parts[1]))
         if not imu.takes_means:         # else the rates are not those at the stamps
             rows[RATES] = rates
@@ -74,11 +68,9 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: Times, fields: tuple[NDArray[np
         rows[RATES] = (*attitude.transverse(theta_dot, phi_dot * np.sin(theta), np.cos(psi),
                                             np.sin(psi)), psi_dot + phi_dot * np.cos(theta))
         rows[TURNS] = phi, psi
-    elif name in ('pose', 'ground_truth/odom'):     # position, attitude, velocity, rates
+    else:           # position, attitude, and of ground_truth/odom velocity, rates
         rows[QUATERNION] = parts[1]
         rows[RATES] = parts[3] if len(parts) > 2 else np.nan
-    else:
-        return None
     norm = np.linalg.norm(rows[QUATERNION], axis=0)
     valid = np.isfinite(norm) & (norm > 0.0)
     rows[QUATERNION] /= np.where(valid, norm, 1.0)
@@ -102,7 +94,7 @@ class Measured:
     nutation_period: float | None
     mean_precession_rate: float | None
     mean_spin_rate: float | None
-    missing: tuple[str, ...]              # why numbers are None
+    missing: str                          # why numbers are None
 
 
 def measure(data: SampledStates, expected: float | None = None) -> Measured:
@@ -130,8 +122,7 @@ def measure(data: SampledStates, expected: float | None = None) -> Measured:
                                               strict=True))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
-    return Measured(count, nutations, None if reason else period, precession, spin,
-                    (reason,) if reason else ())
+    return Measured(count, nutations, None if reason else period, precession, spin, reason)
 
 
 def _spline(values: NDArray[np.generic], index: float) -> BSpline:

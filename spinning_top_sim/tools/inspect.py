@@ -15,45 +15,29 @@ The keys of --json are in docs/logs.md.
 
 import argparse
 import json
-import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
+from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import joined, relative_drift
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli, log_exports
-from spinning_top_sim.tools.recorded_run import (
-    ForeignLogError,
-    RunDescription,
-    read_run_description,
-)
-from spinning_top_sim.tools.survey import Survey
-from spinning_top_sim.tools.verify import compare, objection
+from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
+from spinning_top_sim.tools.survey import Motion, Survey, Topic
+from spinning_top_sim.tools.verify import Comparison, compare, objection
 
-DEGREES = math.degrees(1.0)
 FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
-# Rows of the table of a motion: text, field of Description and Measured, factor.
-ROWS = (('nutation period [s]', 'nutation_period', 1.0),
-        ('mean precession [rad/s]', 'mean_precession_rate', 1.0),
-        ('mean spin [rad/s]', 'mean_spin_rate', 1.0),
-        ('least tilt [deg]', 'theta_min', DEGREES),
-        ('greatest tilt [deg]', 'theta_max', DEGREES),
-        ('least precession [rad/s]', 'precession_min', 1.0),
-        ('greatest precession [rad/s]', 'precession_max', 1.0),
-        ('1 - m (separatrix: 0)', 'separatrix_distance', 1.0),
-        ('L3^2/(4 lambda1 |P|) (sleeps: > 1)', 'gyroscopic_ratio', 1.0))
-Content = Mapping[str, Any]     # as of --json
+NUMBERS = [one.name for one in fields(Description) if one.name != 'name']
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,63 +58,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     cli.check_output(arguments.plot, arguments.animate, *(path for _, path in arguments.export))
     with LogReader(arguments.log) as reader:
-        run, foreign, verdict = None, '', None
-        exported: list[str] = []
+        run, foreign, exported = None, '', list[str]()
         try:
             run = read_run_description(reader)
         except ForeignLogError as error:
             foreign = str(error)
+        for option, reason in (('verify', foreign or objection(run)), ('export', foreign)):
+            if reason and getattr(arguments, option):
+                raise LogError(f'--{option}: {reason}')
         found = Survey(reader, run)
-        refused = foreign if run is None else objection(run)
-        if run is not None:
-            if arguments.verify and not refused:
-                with cli.progress('verified', (found.end_ns - found.begin_ns) / NANOSECONDS, 's',
-                                  quiet=arguments.json) as show:
-                    verdict = compare(run, reader, found.end_ns, lambda stamp_ns: show(
-                        (stamp_ns - found.begin_ns) / NANOSECONDS)).as_json()
+        if run is None:
+            found.notes.append(foreign)
+        else:
+            if arguments.verify:
+                found.verify = compare(run, reader, found.last_ns)
             exported += log_exports.write(reader, run, arguments.export)
-        content = {**_content(reader, found, run), 'ours': run is not None,
-                   'why_not_ours': foreign or None, 'verify': verdict}
     if arguments.json:
         with cli.reader_may_end():
+            text = json.dumps(found, default=lambda one: {
+                name: value for name, value in vars(one).items() if not name.startswith('_')})
             # Numbers that JSON does not have become null.
-            print(json.dumps(json.loads(json.dumps(content), parse_constant=lambda name: None),
-                             indent=2))
+            print(json.dumps(json.loads(text, parse_constant=lambda name: None), indent=2))
     else:
-        for line in _as_text(content):
+        for line in _as_text(found):
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    for option, reason in (('verify', refused), ('export', foreign)):
-        if reason and getattr(arguments, option):
-            raise LogError(f'--{option}: {reason}')
     _draw(arguments, found)
-    passed = reader.whole and (verdict is None or verdict['identical'])
+    passed = found.whole and (found.verify is None or found.verify.identical)
     return cli.OK if passed else cli.FAILED
-
-
-def _content(reader: LogReader, found: Survey, run: RunDescription | None) -> dict[str, Any]:
-    """Return the findings for JSON; docs/logs.md has the keys."""
-    begin_ns, end_ns = reader.span
-    return {
-        'file': str(reader.path), 'whole': reader.whole,
-        'damage': {'torn': reader.torn, 'lost_bytes': reader.lost_bytes,
-                   'report': reader.damage},
-        'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
-        'topics': {name: asdict(topic) for name, topic in found.topics.items()},
-        'notes': found.notes,
-        'run': run and {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
-                        'epoch_ns': run.epoch_ns, 'begun_ns': run.begun_ns, **run.environment},
-        'events': [{'event': event.kind, 'stamp_ns': stamp_ns, 't_ns': event.t_ns,
-                    **event.details} for stamp_ns, event in (run.events if run else ())],
-        'motions': [{
-            'cause': motion.cause, 'begin_ns': motion.begin_ns, 'end_ns': motion.end_ns,
-            'source': motion.source, 'regime': motion.exact and motion.exact.name,
-            **{name: getattr(motion.piece, name) for name in ('l3', 'lz', 'energy')},
-            'exact': motion.exact and asdict(motion.exact),
-            'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
-        'drifts': found.drifts,
-        'orientation_error': {topic: {'max': error} for topic, error in found.errors.items()}}
 
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> None:
@@ -153,91 +109,76 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
             figure.savefig(file.name, format=arguments.plot.suffix[1:] or 'png', dpi=120)
     if arguments.animate is not None:
         with new_file(arguments.animate) as file:
-            pictures.animate(found.shown[0].until(LONGEST_S), FRAMES_PER_S).save(
+            pictures.animate(found.shown[0], FRAMES_PER_S, LONGEST_S).save(
                 file.name, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)  # 4 inches
 
 
-def _as_text(content: Content) -> Iterator[str]:
+def _as_text(found: Survey) -> Iterator[str]:
     """Yield the findings as lines of text."""
-    damage, run = content['damage'], content['run']
-    state = ('truncated' if damage['torn'] else 'whole' if content['whole'] else 'damaged')
-    yield f'{content["file"]}: {state}, {content["duration"]:.6g} s'
-    yield from damage['report']
-    if run is None:
-        yield content['why_not_ours']
-        yield from _topics(content['topics'])
-        return
-    values = run['parameters']
-    solver = values['solver.method']
-    if solver != 'exact':
-        solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
-    yield f'spinning_top_sim {run["version"]}, {solver}, seed {run["seed"]}'
-    yield from _topics(content['topics'])
-    counts = Counter(event['event'] for event in content['events'])
-    yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-           f'{counts["parameters"]} changes of parameters')
-    yield from content['notes']
-    for number, motion in enumerate(content['motions'], start=1):
-        yield from _motion(number, motion, content['begin_ns'])
-    drifts, errors = content['drifts'], content['orientation_error']
-    if drifts or errors:
-        yield from cli.table_lines(
-            'largest relative drifts in a motion, orientation error against the exact solution '
-            '[rad]', ('from', 'E', 'L3', 'Lz', 'error'),
-            [(topic, *(_number(drifts.get(topic, {}).get(name), 2)
-                       for name in ('energy', 'l3', 'lz')),
-              _number(errors.get(topic, {}).get('max'), 3))
-             for topic in content['topics'] if topic in {**drifts, **errors}])
-    if content['verify'] is not None:
-        yield from _verdict(content['verify'])
+    state = 'whole' if found.whole else 'truncated' if found.damage['torn'] else 'damaged'
+    yield f'{found.file}: {state}, {(found.end_ns - found.begin_ns) / NANOSECONDS:.6g} s'
+    yield from found.damage['report']
+    if found.run is not None:
+        values, counts = found.run.values_at_start, Counter(
+            event.kind for _, event in found.run.events)
+        yield (f'spinning_top_sim {found.run.environment["version"]}, '
+               f'{values["solver.method"]}, seed {values["seed"]}')
+        yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+               f'{counts["parameters"]} changes of parameters')
+    yield from found.notes
+    yield from _topics(found.topics)
+    for number, motion in enumerate(found.motions, start=1):
+        yield from _motion(number, motion, found.begin_ns)
+    if found.verify is not None:
+        yield from _verdict(found.verify)
 
 
-def _topics(topics: Content) -> Iterator[str]:
-    head = 'topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing'
-    yield from cli.table_lines('topics', head, [
-        (name, topic['type'], str(topic['count']), _number(topic['rate']),
-         _number(topic['grid_rate']), _number(topic['missing'], 15))
-        for name, topic in topics.items()])
-    for name, topic in topics.items():
-        for begin, end in topic['gaps_ns']:
-            yield f'gap: {name} from {stamp_text(begin)} s to {stamp_text(end)} s'
-
-
-def _motion(number: int, motion: Content, begin_ns: int) -> Iterator[str]:
-    exact, measured = motion['exact'] or {}, motion['measured'] or {}
-    begin, end = (max(motion[at] - begin_ns, 0) / NANOSECONDS for at in ('begin_ns', 'end_ns'))
-    name = motion['regime'] or 'no closed form'
+def _topics(topics: dict[str, Topic]) -> Iterator[str]:
     rows = []
-    for text, key, factor in ROWS:
-        expected, seen = (None if one.get(key) is None else one[key] * factor
-                          for one in (exact, measured))
-        rows.append((text, _number(expected, 12), _number(seen, 12), _number(
-            None if expected is None or seen is None else seen - expected, 2)))
+    for name, topic in topics.items():
+        begin, end = topic.longest_gap_ns or (0, 0)
+        gap = (f'{(end - begin) / NANOSECONDS:.9g}', stamp_text(begin)) if end else ('', '')
+        rows.append((name, topic.type, str(topic.count), _number(topic.rate), *gap))
+    yield from cli.table_lines('topics', (
+        'topic', 'type', 'messages', 'rate [Hz]', 'longest gap [s]', 'from [s]'), rows)
+
+
+def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str]:
+    begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
+                  for at_ns in (motion.begin_ns, motion.end_ns))
+    rows = [(name, _number(exact, 12), _number(seen, 12), _number(
+        None if exact is None or seen is None else seen - exact, 2)) for name, exact, seen in (
+            (name, getattr(motion.exact, name, None), getattr(motion.measured, name, None))
+            for name in NUMBERS)]
+    rows += [(f'drift of {name}', '', '', _number(drift, 2))
+             for name, drift in motion.drifts.items()]
+    rows.append(('orientation_error', '', '', _number(motion.orientation_error, 2)))
     yield from cli.table_lines(
-        f'motion {number} ({motion["cause"]}), {begin:.6g} to {end:.6g} s: {name}',
-        ('', 'exact', 'measured', 'difference'), rows)
-    if measured:
-        yield f'measured from {motion["source"]}: {measured["nutations"]} whole nutations'
-        yield from (f'not measured: {reason}' for reason in measured['missing'])
-    else:
+        f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: '
+        f'{motion.exact.name if motion.exact else "no closed form"}',
+        ('[s, rad, rad/s]', 'exact', 'measured', 'difference'),
+        [row for row in rows if any(row[1:])])
+    if motion.measured is None:
         yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
+    else:
+        yield f'measured from {motion.source}: {motion.measured.nutations} whole nutations'
+        if motion.measured.missing:
+            yield f'not measured: {motion.measured.missing}'
 
 
-def _verdict(verdict: Content) -> Iterator[str]:
-    for warning in verdict['warnings']:
+def _verdict(verdict: Comparison) -> Iterator[str]:
+    for warning in verdict.warnings:
         yield f'verify: {warning}: the last bits may differ for that'
-    compared = sum(verdict['compared'].values())
-    if verdict['stopped']:
-        yield f'verify: the run cannot be computed again: {verdict["stopped"]}'
-    if verdict['identical']:
+    compared = sum(verdict.compared.values())
+    if verdict.stopped:
+        yield f'verify: the run cannot be computed again: {verdict.stopped}'
+    if verdict.identical:
         yield f'verify: identical, all {compared} messages byte for byte'
     else:
-        yield (f'verify: DIFFERENT: {verdict["different"]} of {compared} messages differ, '
-               f'{verdict["missing"]} are missing, {verdict["unexpected"]} should not be there')
-    if first := verdict['first']:
-        place = '' if first['byte'] is None else f', byte {first["byte"]}'
-        yield (f'verify: first: {first["topic"]} at {stamp_text(first["stamp_ns"])} s{place}, '
-               f'{first["field"]}: in the log {first["logged"]}, computed {first["computed"]}')
+        yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
+               f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
+    if verdict.first:
+        yield f'verify: first: {verdict.first}'
 
 
 def _number(value: float | None, digits: int = 6) -> str:

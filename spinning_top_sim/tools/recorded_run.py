@@ -16,15 +16,13 @@ from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import all_channels, recorded
-from spinning_top_sim.times import period_ns
+from spinning_top_sim.times import check_stamp, period_ns
 
 LAST_LOG_TIME_NS = 1 << 62  # the difference of any two log times fits into int64
-# What is computed for a log at most: for a small one, and more for each of its bytes.
-LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
-LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
+# Samples and integration steps of a log at most: of a small one, and more for each of its bytes.
+LEAST_WORK, WORK_A_BYTE = 200_000, 20
 # In logs of 1.x events before the recording are lists of numbers: the time, and these.
 LISTS_OF_1 = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State)),
               'parameters': ('imu.rate',), 'drive': ('x', 'y', 'z', 'stop_ns')}
@@ -53,18 +51,21 @@ class RunDescription:
     history: Sequence[Event]              # what was applied before that
     format: str                           # of the metadata, 1 in logs of 1.x
     environment: Mapping[str, str]        # version, platform and libraries
-    topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
-    commands_topic: str | None            # None where the log has none
-    events_topic: str | None
+    # Topic in the log by that of the stream, such as imu/data_raw, and of events.TOPICS
+    topics: Mapping[str, str]
     events: Sequence[Logged]              # what was applied later
     log_bytes: int                        # size of the log
+    log_end_ns: int                       # latest log time [ns]
 
     @property
     def values_in_effect(self) -> dict[str, Any]:
         """The parameters of the first sample: a change that waits for a reset is not in it."""
-        return {parameter.name: (
-            self.values_at_start if parameter.effect is Effect.RESET
-            else self.values_at_recording)[parameter.name] for parameter in parameters.TABLE}
+        return {**self.values_at_start, **self.changes_at_once}
+
+    @property
+    def changes_at_once(self) -> dict[str, Any]:
+        """The parameters whose changes take effect at once, at the begin of the recording."""
+        return {name: self.values_at_recording[name] for name in parameters.AT_ONCE}
 
 
 def read_run_description(reader: LogReader) -> RunDescription:
@@ -78,18 +79,15 @@ def read_run_description(reader: LogReader) -> RunDescription:
                                   for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [_event_before(entry) for entry in json.loads(metadata['history'])]
-        times_ns = [0, *(event.t_ns for event in history), max(begun_ns, 0)]
-        if times_ns != sorted(times_ns) or not 0 <= epoch_ns <= epoch_ns + times_ns[-1] <= min(
-                LAST_LOG_TIME_NS, reader.span[1] or LAST_LOG_TIME_NS):
-            raise ValueError('times are out of order or too late')
+        check_stamp(epoch_ns)
         environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
         topics = _topics(reader.topics, at_recording)
-        commands_topic = topics.pop(events.COMMANDS, None)
-        events_topic = topics.pop(events.EVENTS, None)
-        return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history,
-                              metadata['format'], environment, topics, commands_topic,
-                              events_topic, [*_events(reader, events_topic, epoch_ns)],
-                              reader.size)
+        journal = [topics[name] for name in topics if name == events.EVENTS]
+        return RunDescription(
+            at_start, at_recording, epoch_ns, begun_ns, history, metadata['format'], environment,
+            topics, [Logged(message.log_time, Event.decoded(message.data))
+                     for message in reader.messages(journal)],
+            reader.size, reader.span[1] or LAST_LOG_TIME_NS)
     except MALFORMED as error:
         raise ForeignLogError(
             f'its metadata {METADATA_NAME!r} or journal cannot be used: {reason_of(error)}',
@@ -99,22 +97,6 @@ def read_run_description(reader: LogReader) -> RunDescription:
 def channels_of(values: Mapping[str, Any]) -> list[Channel]:
     """Return every channel of a run that begins with these parameters."""
     return all_channels(values, Imu(values, period_ns(values['imu.rate'])))
-
-
-def _events(reader: LogReader, topic: str | None, epoch_ns: int) -> Iterator[Logged]:
-    """Yield the events in a topic.  Raises one of MALFORMED for what is none."""
-    reached_ns = epoch_ns - 1
-    for message in reader.messages(topics=[] if topic is None else [topic]):
-        event = Event.decoded(message.data)
-        sent_ns = epoch_ns + event.sent_ns
-        new_epoch_ns = event.details.get('epoch_ns', epoch_ns)
-        if not reached_ns <= sent_ns <= message.log_time <= LAST_LOG_TIME_NS or not (
-                0 <= new_epoch_ns <= message.log_time):
-            raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
-        reached_ns = max(sent_ns, new_epoch_ns - 1) if event.kind == 'reset' else (
-            new_epoch_ns + event.sent_ns)
-        epoch_ns = new_epoch_ns
-        yield Logged(message.log_time, event)
 
 
 def _event_before(entry: Mapping[str, Any] | Sequence[Any]) -> Event:
@@ -140,11 +122,6 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
             if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
 
-def most_samples(run: RunDescription) -> int:
-    """Return how many samples a run that fits into the log has at most."""
-    return LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
-
-
 def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
           ) -> Iterator[tuple[Simulation, Logged | Block]]:
     """
@@ -157,43 +134,39 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     it takes far more work than a run that fits into the log.
     """
     simulation = Simulation(parameters.checked(run.values_at_start), run.epoch_ns)
-    most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
-    samples_left = most_samples(run)
+    limit, count = LEAST_WORK + WORK_A_BYTE * run.log_bytes, 0
+    too_much = ValueError(f'over {limit} samples or integration steps are too many for a log of '
+                          f'{run.log_bytes} bytes')
 
-    def play(t_ns: int, *, with_messages: bool) -> Iterator[tuple[Simulation, Block]]:
-        """Yield the blocks up to a time, as far as the equations and the limits go."""
-        nonlocal samples_left
+    def play(t_ns: int, *, recorded: bool) -> Iterator[tuple[Simulation, Block]]:
+        """Yield the blocks up to a time, as far as the equations and the limit go."""
+        nonlocal count
+        # An event before the first sample has the time 0, and what is sent then the time -1.
+        if not max(simulation.now_ns, 0) <= max(t_ns, 0) <= run.log_end_ns - simulation.epoch_ns:
+            raise ValueError(f't = {t_ns} ns: out of order, or behind the end of the log')
         channels = [channel for channel in simulation.channels
-                    if with_messages and channel.topic in run.topics]
-        samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in channels)
-        if samples_left < 0:
-            raise ValueError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
+                    if recorded and samples and channel.topic in run.topics]
+        count += sum(len(one.times(simulation.now_ns, t_ns)) for one in channels)
+        if count > limit:
+            raise too_much
         with contextlib.suppress(IntegrationError):
             for block in simulation.play(channels, t_ns):
                 yield simulation, block
-                if simulation.trajectory.steps > most_steps:
-                    raise ValueError(f'over {most_steps} integration steps are too many for a log '
-                                     f'of {run.log_bytes} bytes')
+                if simulation.trajectory.steps > limit:
+                    raise too_much
         simulation.now_ns = t_ns
 
     for event in run.history:               # before the recording
-        yield from play(event.t_ns, with_messages=False)
-        _apply(simulation, event)
-    yield from play(run.begun_ns, with_messages=False)
-    simulation.apply('parameters', **{
-        name: run.values_at_recording[name] for name in parameters.AT_ONCE})
+        yield from play(event.t_ns, recorded=False)
+        simulation.apply(event.kind, **event.details)
+    yield from play(run.begun_ns, recorded=False)
+    simulation.apply('parameters', **run.changes_at_once)
     yield simulation, Logged(run.epoch_ns, Event('start', 0, simulation.now_ns))
     for logged in run.events:
         event = logged.event
         if event.kind != 'start' and (event.kind != 'parameters'
                                       or not parameters.AT_ONCE.isdisjoint(event.details)):
-            yield from play(event.sent_ns, with_messages=samples)
-            _apply(simulation, event)
+            yield from play(event.sent_ns, recorded=True)
+            simulation.apply(event.kind, **event.details)
             yield simulation, logged
-    yield from play(end_ns - simulation.epoch_ns, with_messages=samples)
-
-
-def _apply(simulation: Simulation, event: Event) -> None:
-    applied = simulation.apply(event.kind, **event.details)
-    if event.begins_motion and applied.t_ns != event.t_ns:
-        raise ValueError(f'{event.kind} at t = {event.t_ns} ns: applied at {applied.t_ns} ns')
+    yield from play(max(end_ns - simulation.epoch_ns, simulation.now_ns), recorded=True)

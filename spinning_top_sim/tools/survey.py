@@ -1,233 +1,193 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds out what is in a log, and how accurate that is."""
+"""
+Finds out what is in a log, and how accurate that is.
+
+The public attributes of the classes are the keys of `inspect --json`; docs/logs.md says what they
+are.
+"""
 
 import itertools
 import math
 from bisect import bisect_left
-from collections import Counter, defaultdict
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import angle_between
-from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogMessage, LogReader
-from spinning_top_sim.solvers.handover import Piece
-from spinning_top_sim.streams.channel import Channel
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.play import Block
-from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times, ns_array
+from spinning_top_sim.streams import events
+from spinning_top_sim.streams.play import Block, Simulation
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Measured, SampledStates
 from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
+from spinning_top_sim.tools.verify import Comparison
 
-MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
 # Streams that a motion can be measured from, the most accurate first.
-SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
+SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation; a higher rate adds no accuracy
 
 
 @dataclass
 class Topic:
-    """The findings about a topic, with the keys of docs/logs.md."""
+    """The findings about a topic."""
 
     type: str
-    stream: str | None = None
     count: int = 0
-    rate: float | None = None             # [Hz]
-    grid_rate: float | None = None
-    missing: int | None = None
-    gaps_ns: list[tuple[int, int]] = field(default_factory=list)
+    rate: float | None = None                       # [Hz]
+    longest_gap_ns: tuple[int, int] | None = None   # from one message to the next
 
 
-class Section(NamedTuple):
-    """A part of a run in which all rates stay the same."""
-
-    epoch_ns: int                         # stamp of t = 0 [ns]
-    after_ns: int                         # simulated time before the first samples [ns]
-    channels: dict[str, Channel]          # by topic of the log
-    imu: Imu
-
-
-@dataclass
 class Motion:
-    """A motion of the top, from its cause to the next one."""
+    """
+    A motion of the top, which begins where a simulation is.
 
-    cause: str                            # start, command, state, drive or reset
-    begin_ns: int                         # log times [ns]
-    end_ns: int
-    section: Section                      # the first one
-    piece: Piece                          # its constants and its exact solution
-    exact: Description | None             # None if the closed form cannot represent it
-    source: str | None                    # topic that it is measured from
-    # Log times (n,) [ns] and samples (WIDTH, n) of the source
-    samples: list[tuple[Times, NDArray[np.float64]]] = field(default_factory=list)
-    measured: Measured | None = None      # the numbers of `exact`, from the samples
+    topics : of the log, by stream
+    with_exact : whether it is compared with the exact solution, if there is one
+    """
+
+    def __init__(self, cause: str, simulation: Simulation, topics: Mapping[str, str], *,
+                 with_exact: bool) -> None:
+        self.cause = cause
+        self.begin_ns = self.end_ns = simulation.epoch_ns + simulation.now_ns
+        piece = simulation.trajectory.after(max(simulation.now_ns, 0))
+        self.l3, self.lz, self.energy = piece.l3, piece.lz, piece.energy
+        self.exact = piece.describe() if with_exact else None
+        # The source has the most samples in a nutation, up to those that suffice.
+        period_ns = ((self.exact and self.exact.nutation_period) or math.inf) * NANOSECONDS
+        self._channel = max(
+            (channel for name in SOURCES for channel in simulation.channels
+             if channel.topic == name and name in topics), default=None,
+            key=lambda channel: min(period_ns / channel.period_ns, ENOUGH_SAMPLES))
+        self.source = topics[self._channel.topic] if self._channel else None
+        self.measured: Measured | None = None
+        self.drifts: dict[str, float] = {}
+        self.orientation_error: float | None = None
+        self._piece, self._imu, self._epoch_ns = piece, simulation.imu, simulation.epoch_ns
+        self._samples: list[tuple[Times, NDArray[np.float64]]] = []
+
+    def keep(self, messages: list[LogMessage]) -> None:
+        """Keep the samples in messages of the source."""
+        assert self._channel is not None
+        template = self._channel.template
+        fitting = [one for one in messages if len(one.data) == len(template)]
+        self._samples.append(analysis.attitudes_of(
+            self._channel.topic, self._imu, _stamps(fitting),
+            template.decode(b''.join(one.data for one in fitting))))
+
+    def measure(self, begin_ns: int) -> SampledStates | None:
+        """
+        Compare the samples with the motion; measure and return the longest part at one rate.
+
+        Times are those since a log time.  Returns None for fewer than two samples.
+        """
+        if sum(len(stamps_ns) for stamps_ns, _ in self._samples) < 2:
+            return None
+        piece, (stamps_ns, rows) = self._piece, (
+            np.concatenate(parts, axis=-1) for parts in zip(*self._samples, strict=True))
+        self._samples = []
+        states = SampledStates(piece.top, stamps_ns / NANOSECONDS, rows)
+        if piece.rests and not np.isnan(states.l3).all():   # else it has other constants
+            self.drifts = {name: _largest(relative_drift(
+                getattr(states, name), getattr(piece, name))) for name in ('energy', 'l3', 'lz')}
+        if self.exact is not None and piece.exact:
+            # Log times of the run; those of a log that was changed may lie anywhere.
+            truth = piece.exact.states(np.clip(
+                stamps_ns - self._epoch_ns, piece.start_ns, LAST_STAMP_NS))
+            self.orientation_error = _largest(angle_between(
+                states.rows_quaternion, truth.rows_quaternion))
+        part = analysis.longest_run(stamps_ns)
+        states = SampledStates(piece.top, (stamps_ns[part] - begin_ns) / NANOSECONDS,
+                               rows[:, part])
+        self.measured = analysis.measure(
+            states, self.exact.nutation_period if self.exact else None)
+        return states
 
 
 class Survey:
-    """
-    The findings about a log, and about its run if it has one.  Raises LogError.
-
-    end_ns : log time up to which samples were recorded [ns]
-    topics, motions : in the order of the log
-    drifts : by topic, the largest drifts of energy, l3 and lz since the begin of the motion,
-        relative if not from 0
-    errors : by topic, the largest error of an attitude [rad]
-    shown : samples of the motions that were measured
-    notes : what could not be done
-    """
+    """The findings about a log, and about its run if it has one.  Raises LogError."""
 
     def __init__(self, reader: LogReader, run: RunDescription | None) -> None:
+        self.file, self.whole = str(reader.path), reader.whole
+        self.damage: dict[str, Any] = {
+            'torn': reader.torn, 'lost_bytes': reader.lost_bytes, 'changed': reader.changed,
+            'report': reader.damage}
         self.begin_ns, self.end_ns = reader.span
+        self.last_ns = 0        # log time of the last sample [ns]
         self.topics = {topic.name: Topic(topic.type_name) for topic in reader.topics}
+        self.run = run
         self.motions: list[Motion] = []
-        self.drifts: dict[str, dict[str, float]] = {}
-        self.errors: dict[str, float] = {}
-        self.shown: list[SampledStates] = []
         self.notes: list[str] = []
-        self._due: defaultdict[str, list[Times]] = defaultdict(list)    # log times [ns]
-        self._samples: Counter[str] = Counter()     # that were due, in all
+        self.verify: Comparison | None = None
+        self._shown: list[SampledStates] = []
         with np.errstate(all='ignore'):         # a log may hold any numbers
             if run is not None:
                 self._follow(run)
-            stamps_ns = self._read(reader)
-            if self.motions:        # the last event may be later than the last sample
-                last = self.motions[-1]
-                self.end_ns = last.end_ns = max(last.begin_ns, 0, *(
-                    int(stamps_ns[topic].max(initial=0)) for topic in last.section.channels))
-            for name, topic in self.topics.items():
-                self._count(topic, stamps_ns[name], self._due[name])
+            self._read(reader)
             for motion in self.motions:
-                self._measure(motion)
+                try:
+                    states = motion.measure(self.begin_ns)
+                except MALFORMED as error:
+                    self.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
+                else:
+                    self._shown += [states] if states else []
+
+    @property
+    def shown(self) -> list[SampledStates]:
+        """The samples of each motion that was measured."""
+        return self._shown
 
     def _follow(self, run: RunDescription) -> None:
-        """Compute the motions of a run, and when messages were due."""
-        for name, topic in run.topics.items():
-            self.topics[topic].stream = name
-        motions, section = self.motions, None
+        """Compute the motions of a run."""
+        motions, epoch_ns = self.motions, run.epoch_ns
         try:
             for simulation, done in recorded_run.rerun(run, self.end_ns):
-                if isinstance(done, Block):
-                    continue
-                event = done.event
-                if section is not None:
-                    motions[-1].end_ns = section.epoch_ns + event.sent_ns
-                    self._expect(run, section, event.sent_ns)
-                section = Section(simulation.epoch_ns, simulation.now_ns, {
-                    run.topics[channel.topic]: channel for channel in simulation.channels
-                    if channel.topic in run.topics}, simulation.imu)
                 # The velocities of the pivot belong to one motion.
-                if event.begins_report and not (
-                        event.kind == 'drive' and motions and motions[-1].cause == 'drive'):
-                    begin_ns = section.epoch_ns + section.after_ns
-                    piece = simulation.trajectory.after(max(simulation.now_ns, 0))
-                    exact = piece.describe() if len(motions) < MOST_EXACT else None
-                    motions.append(Motion(event.kind, begin_ns, begin_ns, section, piece, exact,
-                                          _source(run, section, exact)))
+                if isinstance(done, Block) or done.event.kind == 'parameters' or (
+                        done.event.kind == 'drive' and motions[-1].cause == 'drive'):
+                    continue
+                if motions:
+                    motions[-1].end_ns = epoch_ns + done.event.sent_ns
+                epoch_ns = simulation.epoch_ns
+                motions.append(Motion(done.event.kind, simulation, run.topics,
+                                      with_exact=len(motions) < MOST_EXACT))
         except MALFORMED as error:
             self.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
-        if section is not None:
-            self._expect(run, section, self.end_ns - section.epoch_ns)
         if len(motions) > MOST_EXACT:
             self.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact '
                               'one')
 
-    def _expect(self, run: RunDescription, section: Section, end_ns: int) -> None:
-        """Note when the messages of a section up to a simulated time were due."""
-        for name, channel in section.channels.items():
-            self.topics[name].grid_rate = NANOSECONDS / channel.period_ns
-            times = channel.times(max(section.after_ns, -1), end_ns)
-            before, most = self._samples[name], recorded_run.most_samples(run)
-            self._samples[name] += len(times)
-            if self._samples[name] <= most:
-                self._due[name].append(section.epoch_ns + np.unique(channel.due(ns_array(times))))
-            elif before <= most:
-                self._due[name].clear()
-                self.notes.append(f'{name}: what is missing is not counted: the log lacks most of '
-                                  f'{self._samples[name]} samples')
-
-    def _read(self, reader: LogReader) -> dict[str, Times]:
-        """Compare all messages with their motions; return the log times of each topic [ns]."""
+    def _read(self, reader: LogReader) -> None:
+        """Count the messages, and keep the samples of the sources with their motions."""
         ends_ns = [motion.end_ns for motion in self.motions[:-1]]
+        sources = {motion.source for motion in self.motions}
+        sampled = {topic for stream, topic in (self.run.topics if self.run else {}).items()
+                   if stream not in events.TOPICS}
         blocks_ns = {topic: [np.empty(0, np.int64)] for topic in self.topics}
         for topic, messages in reader.groups():
             blocks_ns[topic].append(_stamps(messages))
-            if self.motions and self.topics[topic].stream is not None:
-                for number, part in itertools.groupby(
-                        messages, lambda message: bisect_left(ends_ns, message.log_time)):
-                    self._compare(self.motions[number], topic, list(part))
-        return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
-
-    def _compare(self, motion: Motion, topic: str, messages: list[LogMessage]) -> None:
-        """Compare messages with their motion, and keep those that it is measured from."""
-        section, piece = motion.section, motion.piece
-        channel = section.channels[topic]
-        fitting = [one for one in messages if len(one.data) == len(channel.template)]
-        attitudes = analysis.attitudes_of(
-            channel.topic, section.imu, _stamps(fitting),
-            channel.template.decode(b''.join(one.data for one in fitting)))
-        if attitudes is None:
-            return
-        if topic == motion.source:
-            motion.samples.append(attitudes)
-        if not piece.rests:         # there are other constants in each of its pieces
-            return
-        # Log times of the run; those of a log that was changed may lie anywhere.
-        times_ns = np.clip(attitudes[0] - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
-        states = SampledStates(piece.top, times_ns / NANOSECONDS, attitudes[1])
-        if not np.isnan(states.l3).all() and channel.topic != 'imu/data':       # which is noisy
-            drifts = self.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
-            for name, largest in drifts.items():
-                drifts[name] = max(largest, _largest(
-                    relative_drift(getattr(states, name), getattr(piece, name))))
-        if motion.exact is not None and piece.exact:
-            truth = piece.exact.states(times_ns)
-            error = _largest(angle_between(states.rows_quaternion, truth.rows_quaternion))
-            self.errors[topic] = max(self.errors.get(topic, 0.0), error)
-
-    def _count(self, topic: Topic, stamps_ns: Times, due: list[Times]) -> None:
-        """Count messages, and those that were due and are missing."""
-        topic.count = len(stamps_ns)
-        if topic.count > 1 and (duration_ns := int(stamps_ns[-1] - stamps_ns[0])):
-            topic.rate = (topic.count - 1) / duration_ns * NANOSECONDS
-        if due:
-            due_ns = np.concatenate(due)
-            due_ns = due_ns[due_ns <= self.end_ns]
-            missing = ~np.isin(due_ns, stamps_ns)
-            topic.missing = int(np.sum(missing))
-            edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))
-            topic.gaps_ns = [(int(due_ns[begin]), int(due_ns[end - 1])) for begin, end in zip(
-                edges[::2], edges[1::2], strict=True)][:MOST_GAPS]
-
-    def _measure(self, motion: Motion) -> None:
-        """Measure a motion from the longest part of its samples that has one rate."""
-        if sum(len(stamps_ns) for stamps_ns, _ in motion.samples) < 2:
-            return
-        stamps_ns, rows = (np.concatenate(parts, axis=-1)
-                           for parts in zip(*motion.samples, strict=True))
-        motion.samples, part = [], analysis.longest_run(stamps_ns)
-        states = SampledStates(motion.piece.top, (stamps_ns[part] - self.begin_ns) / NANOSECONDS,
-                               rows[:, part])
-        try:
-            motion.measured = analysis.measure(
-                states, motion.exact.nutation_period if motion.exact else None)
-        except MALFORMED as error:
-            self.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
-        else:
-            self.shown.append(states)
-
-
-def _source(run: RunDescription, section: Section, exact: Description | None) -> str | None:
-    """Return the topic that a motion is measured from, as docs/logs.md says."""
-    period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
-    return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
-               key=lambda name: min(period_ns / section.channels[name].period_ns, ENOUGH_SAMPLES))
+            for number, part in itertools.groupby(
+                    messages if topic in sources else (),
+                    lambda message: bisect_left(ends_ns, message.log_time)):
+                if topic == self.motions[number].source:
+                    self.motions[number].keep(list(part))
+        for name, found in self.topics.items():
+            stamps_ns = np.concatenate(blocks_ns[name])
+            found.count = len(stamps_ns)
+            if found.count > 1:
+                longest, length_ns = int(np.argmax(np.diff(stamps_ns))), int(np.ptp(stamps_ns))
+                found.longest_gap_ns = int(stamps_ns[longest]), int(stamps_ns[longest + 1])
+                found.rate = (found.count - 1) / length_ns * NANOSECONDS if length_ns else None
+            if found.count and name in sampled:
+                self.last_ns = max(self.last_ns, int(stamps_ns[-1]))
+        if self.motions:        # the last event may be later than the last sample
+            self.motions[-1].end_ns = max(self.motions[-1].begin_ns, self.last_ns)
 
 
 def _stamps(messages: list[LogMessage]) -> Times:

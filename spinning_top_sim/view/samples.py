@@ -71,9 +71,7 @@ class SampledTrack(Track):
         template, data = self.templates[topic], b''.join(messages)
         stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
         fields = template.decode(data)
-        found = attitudes_of(topic, self._imu, stamps, fields)
-        assert found is not None
-        known_ns, samples = found
+        known_ns, samples = attitudes_of(topic, self._imu, stamps, fields)
         place = np.full((len(known_ns), 3), np.nan)
         if topic in ('pose', 'ground_truth/odom'):
             place = fields[0][np.isin(stamps, known_ns)]

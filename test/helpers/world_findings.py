@@ -192,7 +192,7 @@ def verify(reader, kept):
     run = read_run_description(reader)
     stamps = [kept[topic][-1][0] for topic in run.topics.values() if topic in kept]
     if stamps and not reader.lost_bytes:
-        comparison = compare(run, reader, max(stamps), lambda stamp_ns: None)
+        comparison = compare(run, reader, max(stamps))
         assert comparison.identical, comparison.first or comparison.stopped
 
 
