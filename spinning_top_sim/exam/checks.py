@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.measures import NEES_OFF, degrees
-from spinning_top_sim.exam.motions import RATE, Reals
-from spinning_top_sim.exam.runs import ANSWER, BIAS, BIAS_S, FIELD_TURN, LARGE, STILL, Exam
+from spinning_top_sim.exam.measures import NEES_OFF, USELESS_DEG, degrees
+from spinning_top_sim.exam.motions import RATE, STEPS, Reals
+from spinning_top_sim.exam.runs import ANSWER, BIAS, BIAS_S, LARGE, SMALL, STILL, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import AXES, rms
@@ -25,16 +25,16 @@ from spinning_top_sim.tools.report import Mark
 
 # Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
-GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
+GAIN_OFF = 0.02         # of what should be 1: less than sensors differ in scale
 EXPLAINED = 0.25        # of an effect: what its cause may leave of it
-TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
 DELAY = 0.25            # samples: half of what a mean of two steps is late
-UNEVEN = 0.8            # 1 - ratio of gains about two axes: those of right filters differ less
-FOLLOWS = 0.7           # half of the power: the filter is faster than the motion
+# Of shares that are 1 where a filter ignores gravity about an axis, or all but the force; right
+# ones that weigh both have up to 0.25, 0.75.
+IGNORES = 0.9
+# Of large turns: half of what a step of first order, 2 atan(x / 2), misses.
+TURNS_OFF = LARGE ** 2 / 24.0
+GROWS = 2.0 + GAIN_OFF  # an error that grows slower and slower at most doubles in the second half
 BIAS_OFF = 0.3          # of a bias: integrals that leak keep as much
-MOVES = 0.6             # of a bias in a second: a turn by 80 deg changes its axes by 0.83
-GROWS = 2.02            # an error that grows slower and slower at most doubles in the second half
-NOISY_DEG = 5.0         # a right filter that corrects first lags a step, on the top 2.3 deg
 
 
 class Measured(NamedTuple):
@@ -78,7 +78,7 @@ def convention(exam: Exam) -> Measured:
     found = conventions.best(exam.outcomes('excitation')[0].estimates[rests],
                              exam.run.truth[rests], steady=not exam.heading)
     before, after = np.degrees((found.before, found.after)).tolist()
-    if after < max(0.1 * before, CLEAN_DEG):
+    if after < max(EXPLAINED * before, CLEAN_DEG):
         exam.convention = found.convention
     name = exam.convention.name
     return Measured(before, f'read as {name}, the error at rest falls from {before:.3g} to '
@@ -89,10 +89,10 @@ def gyroscope(exam: Exam) -> Measured:
     """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
     turns, moves = exam.answers('turns')
     matrix = np.linalg.lstsq(turns, moves[:, -1], rcond=None)[0].T
-    left = float(np.median(np.linalg.norm(moves[:, -1] - turns @ matrix.T, axis=1)
-                           / np.linalg.norm(turns, axis=1)))
+    others = np.linalg.norm(moves[:, ANSWER // 2:] - (turns @ matrix.T)[:, np.newaxis], axis=2)
+    left = float(np.median(np.max(others, axis=1) / np.linalg.norm(turns, axis=1)))
     off = np.max(np.abs(matrix - np.eye(3)), axis=0)
-    if left > max(EXPLAINED * np.max(off), GAIN_OFF):
+    if left > EXPLAINED * max(np.max(off), GAIN_OFF):
         return Measured(left, f'of turns of the gyroscope {left:.2g} move the attitude otherwise, '
                         'which no matrix explains', 'accuracy', EXPLAINED)
     return Measured(float(np.max(off)), 'a rate about ' + '; '.join(
@@ -101,40 +101,45 @@ def gyroscope(exam: Exam) -> Measured:
         for k, column in enumerate(matrix.T) if off[k] > GAIN_OFF))
 
 
-def tilt_at_rest(exam: Exam) -> Measured:
-    """Judge the tilt at which new filters come to rest: no estimate of a bias explains it."""
-    tilt = _at_rest(exam.settled, slice(2))
+def at_rest(exam: Exam) -> Measured:
+    """Judge where new filters come to rest: no estimate of a bias explains an error there."""
+    tilt, whole = (_at_rest(exam.settled, slice(axes)) for axes in (2, 3))
     if tilt > CLEAN_DEG:        # by the field?
         tilt = min(tilt, _at_rest(exam.outcomes('starts, no field'), slice(2)))
-    return Measured(tilt, f'where a new filter comes to rest, the tilt is {tilt:.3g} deg off, '
-                    'with and without a field')
-
-
-def error_at_rest(exam: Exam) -> Measured | None:
-    """Judge the whole error at which new filters come to rest in a field."""
-    if not exam.heading:
-        return None
-    error = _at_rest(exam.settled, slice(3))
-    return Measured(error, 'where a new filter comes to rest in a field, the attitude is '
-                    f'{error:.3g} deg off')
+    if tilt > CLEAN_DEG or not exam.heading:
+        return Measured(tilt, f'where a new filter comes to rest, the tilt is {tilt:.3g} deg off, '
+                        'with and without a field')
+    return Measured(whole, 'where a new filter comes to rest in a field, the attitude is '
+                    f'{whole:.3g} deg off; without a field the tilt is right', 'magnetometer')
 
 
 def delay(exam: Exam) -> Measured:
     """Identify the delay with which the attitude follows the gyroscope."""
-    gains = np.median(_gains(*exam.answers('turns')), axis=0)
-    late = float(np.sum(1.0 - gains / gains[-1]))
-    return Measured(abs(late), f'the attitude follows the gyroscope {abs(late):.3g} samples '
-                    f'{"late" if late > 0.0 else "ahead"}')
+    off = 1.0 - np.median(_gains(*exam.answers('turns')), axis=0)
+    off -= off[-1]
+    late = float(np.sum(off))
+    evidence = (f'the attitude follows the gyroscope {abs(late):.3g} samples '
+                f'{"late" if late > 0.0 else "ahead"}')
+    if np.max(np.abs(off[ANSWER // 2:])) > EXPLAINED * np.max(np.abs(off)):
+        return Measured(abs(late), f'{evidence}, and does not end to do so: that is no delay',
+                        'accuracy')
+    return Measured(abs(late), evidence)
 
 
 def steps(exam: Exam) -> Measured:
-    """Compare turns in steps of different lengths."""
-    gains = _gains(*exam.answers('uneven turns'))[:, 0]
-    worst = int(np.argmax(np.abs(gains - 1.0)))
-    length = exam.run.dt[exam.uneven[worst]]
-    return Measured(float(abs(gains[worst] - 1.0)), f'in a step of {1e3 * length:g} ms a turn '
-                    f'moves the attitude {gains[worst]:.3g} times as far: the length of the step '
-                    'is misused')
+    """Compare turns in steps of different lengths: most of those of a length are misused."""
+    turns, moves = exam.answers('uneven turns')
+    off = np.linalg.norm(moves[:, 0] - turns, axis=1)
+    of_length = np.resize(STEPS, len(off)) == np.reshape(STEPS, (-1, 1))
+    share = [np.median((off / np.linalg.norm(turns, axis=1))[rows]) for rows in of_length]
+    worst = int(np.argmax(share))
+    evidence = (f'in steps of {1e3 * STEPS[worst]:g} ms {share[worst]:.3g} of a turn is not as '
+                'the gyroscope reads it')
+    turns, moves = exam.answers('turns')
+    equal = np.median(np.linalg.norm(moves[:, 0] - turns, axis=1))
+    if equal > EXPLAINED * np.median(off[of_length[worst]]):
+        return Measured(float(share[worst]), f'{evidence}, nor in equal steps', 'accuracy')
+    return Measured(float(share[worst]), f'{evidence}: the length is misused')
 
 
 def large_turns(exam: Exam) -> Measured:
@@ -165,7 +170,7 @@ def clean(exam: Exam) -> Measured:
     whole = np.degrees(exam.errors('excitation').whole)
     if np.max(whole) > CLEAN_DEG:
         whole = min(whole, np.degrees(exam.errors('force of the begin').whole), key=np.max)
-    parts = exam.motion.parts[1:-1]         # from when it has settled to the uneven steps
+    parts = exam.motion.parts[1:]           # from when it has settled
     worst = {part.kind: 0.0 for part in parts}
     for kind, begin, end in parts:
         worst[kind] = max(worst[kind], float(np.max(whole[begin - exam.lead:end - exam.lead])))
@@ -175,22 +180,21 @@ def clean(exam: Exam) -> Measured:
 
 def reported_bias(exam: Exam) -> Measured | None:
     """Judge the bias that is reported, unless it still comes closer to the true one."""
-    (outcome,), off, ends = exam.outcomes('bias'), [], []
+    (outcome,), off, said = exam.outcomes('bias'), [], []
     for axes, rows in _of_bias(exam):
-        told = outcome.biases[rows][np.isfinite(outcome.biases[rows][:, 0])] / BIAS
+        told = outcome.biases[rows][np.isfinite(outcome.biases[rows][:, 0])]
         if len(told) < 4:           # a quarter of them is the end
             return None
-        ends += [told[0], told[-1]]
+        said += [told[0], told[-1]]
         for axis in axes:
             *_, before, last = (float(np.max(part)) for part in np.array_split(
-                np.abs(told[:, axis] - 1.0), 4))
-            off.append(last if last > 0.99 * before else 0.0)
+                np.abs(told[:, axis] / BIAS[axis] - 1.0), 4))
+            off.append(last if last > (1.0 - GAIN_OFF) * before else 0.0)
     # The turn between the rests changes the axes of the world, not those of the gyroscope.
-    if (moved := float(np.max(np.abs(ends[2] - ends[1])[:2]))) > MOVES:
-        return Measured(moved, 'a fast turn changes the bias that the filter says: it is kept in '
-                        'axes of the world')
-    return Measured(max(off), f'the bias is {_in_degrees(BIAS)} deg/s, and in the end the filter '
-                    f'says {_in_degrees(ends[-1] * BIAS)}')
+    off += (np.abs(said[2] - said[1]) / np.abs(BIAS))[:2].tolist()
+    ends = '; '.join(map(_in_degrees, said))
+    return Measured(max(off), f'the bias is {_in_degrees(BIAS)} deg/s; at begin and end of the '
+                    f'rests before and after a turn the filter says {ends}')
 
 
 def effect_of_bias(exam: Exam) -> Measured:
@@ -215,8 +219,8 @@ def heading_answer(exam: Exam) -> Measured | None:
     if not exam.heading:
         return None
     (still,), (moved,) = exam.outcomes('excitation'), exam.outcomes('field turned')
-    share = float(errors_of(still.estimates[-1:], moved.estimates[-1:]).heading[0]) / FIELD_TURN
-    return Measured(1.0 - share, f'of a turn of the field by {degrees(FIELD_TURN)} the heading '
+    share = float(errors_of(still.estimates[-1:], moved.estimates[-1:]).heading[0]) / SMALL
+    return Measured(1.0 - share, f'of a turn of the field by {degrees(SMALL)} the heading '
                     f'follows {share:.2g} within {len(exam.run.dt) / 2.0 / RATE:.0f} s')
 
 
@@ -294,26 +298,23 @@ CHECKS = (
     Check('convention', 'convention_deg', CLEAN_DEG, 'at rest, as it is told', convention, FIRST),
     Check('gyroscope', 'rates_off', GAIN_OFF, 'matrix of the rates off the identity', gyroscope,
           FIRST),
-    Check('accelerometer', 'rest_tilt_deg', CLEAN_DEG, 'of new filters', tilt_at_rest,
-          TURNS),
-    Check('magnetometer', 'rest_deg', CLEAN_DEG, 'of new filters in a field', error_at_rest,
-          (*TURNS, 'accelerometer')),
+    Check('accelerometer', 'rest_deg', CLEAN_DEG, 'of new filters', at_rest, TURNS),
     Check('timing', 'delay_samples', DELAY, 'of the attitude behind the gyroscope', delay, INPUTS),
     Check('timing', 'steps_off', GAIN_OFF, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
     Check('integration', 'large_turn_off', TURNS_OFF, 'turns of 0.3 rad in a step', large_turns,
           INPUTS),
-    Check('accelerometer', 'tilt_answer', UNEVEN, '1: gravity does not lead a tilt back',
+    Check('accelerometer', 'tilt_answer', IGNORES, '1: gravity does not lead a tilt back',
           tilt_answer, INPUTS),
     Check('accuracy', 'clean_deg', CLEAN_DEG, 'largest error without noise', clean,
           (*ALL, 'integration')),
     Check('bias', 'bias_report_off', BIAS_OFF, 'of a bias, relative', reported_bias, ALL),
     Check('bias', 'bias_growth', GROWS, 'of the tilt by a bias in half of a rest', effect_of_bias,
           ALL),
-    Check('magnetometer', 'heading_answer', 0.99, '1: the heading does not follow the field',
-          heading_answer, (*ALL, 'integration')),
-    Check('lever_arm', 'lever_arm', FOLLOWS, 'share of the tilt of the specific force', lever_arm,
+    Check('magnetometer', 'heading_answer', 1.0 - GAIN_OFF,
+          '1: the heading does not follow the field', heading_answer, (*ALL, 'integration')),
+    Check('lever_arm', 'lever_arm', IGNORES, 'share of the tilt of the specific force', lever_arm,
           ALL),
-    Check('accuracy', 'noisy_deg', NOISY_DEG, 'rms with noise', noisy, ALL),
+    Check('accuracy', 'noisy_deg', USELESS_DEG, 'rms with noise', noisy, ALL),
     Check('covariance', 'nees_off', NEES_OFF[0], 'squared error over its covariance', covariance,
           (*ALL, 'integration', 'lever_arm', 'bias')),
 )

@@ -14,6 +14,7 @@ from spinning_top_sim.tools.identify import rms
 
 ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
 NEES_OFF = 4.0, 20.0    # factors by which a covariance may be too small, and on the safe side
+USELESS_DEG = 10.0      # a larger error than that of any published filter with tuned gains
 
 
 def rmse(estimates: Reals, truth: Reals) -> Reals:

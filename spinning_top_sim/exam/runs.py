@@ -20,22 +20,21 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures, motions
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Reals, Run
+from spinning_top_sim.exam.motions import RATE, STARTS, Motion, Reals, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
 # A filter is settled if it is STILL in the second half of rests at the start; slow ones get
 # longer ones.
 LEADS_S, STILL = (10.0, 30.0, 120.0), math.radians(0.05)
 ARM = 0.1, 0.0, 0.0                         # of the IMU off the axis [m]
-FIELD_TURN = math.radians(6.0)              # of the field about the vertical
-SMALL, LARGE = 0.05, 0.3        # kicks [rad], of first order; that a step of first order misses
+# Of kicks, and of the field [rad], of first order; of kicks that a step of first order misses.
+SMALL, LARGE = 0.05, 0.3
 # Samples for an answer: for a late one, too, and before gravity leads back what is wrong; it has
 # six times that to lead a tilt back.
 ANSWER = 30
 # Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on;
 # and how long it lasts in each of two rests [s], so that a slow filter shows where it tends to.
 BIAS, BIAS_S = np.array((0.006, -0.0055, 0.009)), 80.0
-NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
 
 
 class Exam:
@@ -70,7 +69,7 @@ class Exam:
         """New filters at rest, until they are settled or the patience ends, as they are told."""
         for seconds in LEADS_S:
             outcomes = self._feed([Motion(start).rest(seconds).run('start')
-                                   for start in (NEAR, *motions.STARTS)])
+                                   for start in STARTS])
             if all(measures.settled(one.estimates, STILL) for one in outcomes):
                 break
         return outcomes
@@ -101,13 +100,6 @@ class Exam:
         return np.array([part.end for part in self.motion.of('rests')])
 
     @cached_property
-    def uneven(self) -> NDArray[np.intp]:
-        """Uneven steps: each of STEPS once, far apart."""
-        (part,) = self.motion.of('uneven steps')
-        kinds = len(motions.STEPS)
-        return part.begin + (3 * kinds + 1) * np.arange(1, kinds + 1)
-
-    @cached_property
     def heading(self) -> bool:
         """Whether the field changes attitudes: only then the heading is judged against north."""
         return measures.differ(*(self.outcomes(name)[0].estimates
@@ -122,23 +114,26 @@ class Exam:
     def answers(self, name: str) -> tuple[Reals, Reals]:
         """Return kicks of a run (n, 3), and by how much they move attitudes (n, ANSWER, 3)."""
         (still,), (moved,) = self.outcomes('no field'), self.outcomes(name)
-        turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
+        turns = (moved.run.gyroscope - still.run.gyroscope) * moved.run.dt[:, np.newaxis]
         apart = measures.increments(moved.estimates) - measures.increments(still.estimates)
         steps = np.flatnonzero(np.any(turns, axis=1))
         return turns[steps], np.cumsum(apart[steps[:, np.newaxis] + np.arange(ANSWER)], axis=1)
 
-    def kicked(self, steps: NDArray[np.intp], turns: Reals) -> Run:
-        """Return the run without field, with turns of the gyroscope alone (n, 3) [rad]."""
+    def kicked(self, steps: NDArray[np.intp], turns: Reals,
+               lengths: Reals | float = 1.0 / RATE) -> Run:
+        """Return the run without field, with kicks (n, 3) [rad] in steps of these lengths [s]."""
         run = self.run.without_field()
-        gyroscope = run.gyroscope.copy()
-        gyroscope[steps] += turns / run.dt[steps, np.newaxis]
-        return replace(run, gyroscope=gyroscope)
+        gyroscope, dt = run.gyroscope.copy(), run.dt.copy()
+        dt[steps] = lengths
+        gyroscope[steps] += turns / dt[steps, np.newaxis]
+        return replace(run, gyroscope=gyroscope, dt=dt)
 
-    def turned(self, steps: NDArray[np.intp], sizes: Reals | float) -> Run:
-        """Return the run without field, with kicks about the vertical of so many rad (n,)."""
-        (still,) = self.outcomes('no field')
-        return self.kicked(steps, np.reshape(sizes, (-1, 1)) * measures.up(
-            still.estimates[steps - 1]))
+    def turned(self, size: float, lengths: Reals | float = 1.0 / RATE) -> Run:
+        """Return kicks about the vertical in the rests, of so many rad in a step of 1 / RATE."""
+        steps, (still,) = self.ends - ANSWER, self.outcomes('no field')
+        sizes = np.broadcast_to(size * RATE * np.asarray(lengths), steps.shape)
+        return self.kicked(steps, sizes[:, np.newaxis] * measures.up(still.estimates[steps - 1]),
+                           lengths)
 
 
 def _tilts(exam: Exam) -> list[Run]:
@@ -155,7 +150,7 @@ def _tilts(exam: Exam) -> list[Run]:
 def _field_turned(exam: Exam) -> list[Run]:
     """Turn the field about the vertical, from the middle on."""
     turns, middle = Rotation.from_quat(exam.run.truth), len(exam.run.dt) // 2
-    field = turns.inv().apply(Rotation.from_euler('z', FIELD_TURN).apply(motions.FIELD))
+    field = turns.inv().apply(Rotation.from_euler('z', SMALL).apply(motions.FIELD))
     field[:middle] = exam.run.magnetometer[:middle]
     return [replace(exam.run, magnetometer=field)]
 
@@ -179,21 +174,20 @@ def _arm(exam: Exam) -> list[Run]:
 
 def _bias(exam: Exam) -> list[Run]:
     """Add a bias in a rest, and in one in which its axes of the world have other signs."""
-    run = Motion(NEAR).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S).run('bias')
+    run = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S).run('bias')
     return [replace(run, gyroscope=run.gyroscope + BIAS)]
 
 
 RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     # The first seed twice: a filter says the same of the same.
-    'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
-                                         NOISE_S) for seed in (*exam.seeds, exam.seeds[0])],
+    'noise': lambda exam: [
+        motions.noisy(f'noise, seed {seed}', exam.imu, seed, LEADS_S[0], motions.TOP_S)
+        for seed in (*exam.seeds, exam.seeds[0])],
     'excitation': lambda exam: [exam.run],
     'no field': lambda exam: [exam.run.without_field()],
     'starts, no field': lambda exam: [one.run.without_field() for one in exam.starts],
     'force of the begin': _begin, 'field turned': _field_turned,
-    'turns': lambda exam: [exam.turned(exam.ends - ANSWER, SMALL)],
-    'large turns': lambda exam: [exam.turned(exam.ends - ANSWER, LARGE)],
-    # As fast as those of equal steps.
-    'uneven turns': lambda exam: [exam.turned(
-        exam.uneven, SMALL * RATE * exam.run.dt[exam.uneven])],
+    'turns': lambda exam: [exam.turned(SMALL)],
+    'large turns': lambda exam: [exam.turned(LARGE)],
+    'uneven turns': lambda exam: [exam.turned(SMALL, np.resize(motions.STEPS, len(exam.ends)))],
     'tilts': _tilts, 'bias': _bias, 'lever arm': _arm}

@@ -110,10 +110,11 @@ class IntegralInTheWorld(Mahony):
     """Keeps its integral in axes of the world, and says it in those of the sensor."""
 
     def update(self, *readings):
-        if self._q is not None:
-            self.bias = reference.matrix_of(self._q).T @ self._kept
+        before = self._q
         said = super().update(*readings)
-        self._kept = reference.matrix_of(said) @ self.bias
+        if before is not None:
+            turn = reference.matrix_of(said).T @ reference.matrix_of(before)
+            self.bias = turn @ self.bias
         return said
 
 
