@@ -8,6 +8,7 @@ out where one of the faults in `needs` has been found, and the report says so.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import NEES_OFF, USELESS_DEG, degrees
-from spinning_top_sim.exam.motions import RATE, STEPS, Reals
-from spinning_top_sim.exam.runs import ANSWER, BIAS, BIAS_S, LARGE, SMALL, STILL, Exam
+from spinning_top_sim.exam.motions import FIELD, RATE, STEPS, Reals
+from spinning_top_sim.exam.runs import ANSWER, BACK, BIAS, BIAS_S, LARGE, SMALL, STILL, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import AXES, rms
@@ -35,6 +36,7 @@ IGNORES = 0.9
 TURNS_OFF = LARGE ** 2 / 24.0
 GROWS = 2.0 + GAIN_OFF  # an error that grows slower and slower at most doubles in the second half
 BIAS_OFF = 0.3          # of a bias: integrals that leak keep as much
+ARM = 0.1, 0.0, 0.0     # of the IMU off the axis [m]
 
 
 class Measured(NamedTuple):
@@ -66,7 +68,7 @@ class Check(NamedTuple):
 
 def repeat(exam: Exam) -> Measured:
     """Feed two filters of one process with the same readings."""
-    one, *_, same = exam.outcomes('noise')
+    one, *_, same = exam.noise
     apart = measures.largest_turn(one.estimates, same.estimates)
     return Measured(apart, 'two new filters of one process that get the same readings are '
                     f'{degrees(apart)} apart: they are random, or share state')
@@ -75,8 +77,8 @@ def repeat(exam: Exam) -> Measured:
 def convention(exam: Exam) -> Measured:
     """Read the attitudes at the rests in every convention; undo the one that fits."""
     rests = exam.ends - 1
-    found = conventions.best(exam.outcomes('excitation')[0].estimates[rests],
-                             exam.run.truth[rests], steady=not exam.heading)
+    found = conventions.best(exam.plain.estimates[rests], exam.run.truth[rests],
+                             steady=not exam.heading)
     before, after = np.degrees((found.before, found.after)).tolist()
     if after < max(EXPLAINED * before, CLEAN_DEG):
         exam.convention = found.convention
@@ -87,7 +89,7 @@ def convention(exam: Exam) -> Measured:
 
 def gyroscope(exam: Exam) -> Measured:
     """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
-    turns, moves = exam.answers('turns')
+    turns, moves = exam.answers()
     matrix = np.linalg.lstsq(turns, moves[:, -1], rcond=None)[0].T
     others = np.linalg.norm(moves[:, ANSWER // 2:] - (turns @ matrix.T)[:, np.newaxis], axis=2)
     left = float(np.median(np.max(others, axis=1) / np.linalg.norm(turns, axis=1)))
@@ -105,7 +107,8 @@ def at_rest(exam: Exam) -> Measured:
     """Judge where new filters come to rest: no estimate of a bias explains an error there."""
     tilt, whole = (_at_rest(exam.settled, slice(axes)) for axes in (2, 3))
     if tilt > CLEAN_DEG:        # by the field?
-        tilt = min(tilt, _at_rest(exam.outcomes('starts, no field'), slice(2)))
+        tilt = min(tilt, _at_rest(exam.outcomes('starts, no field', lambda: [
+            one.run.without_field() for one in exam.starts]), slice(2)))
     if tilt > CLEAN_DEG or not exam.heading:
         return Measured(tilt, f'where a new filter comes to rest, the tilt is {tilt:.3g} deg off, '
                         'with and without a field')
@@ -115,7 +118,7 @@ def at_rest(exam: Exam) -> Measured:
 
 def delay(exam: Exam) -> Measured:
     """Identify the delay with which the attitude follows the gyroscope."""
-    off = 1.0 - np.median(_gains(*exam.answers('turns')), axis=0)
+    off = 1.0 - np.median(_gains(*exam.answers()), axis=0)
     off -= off[-1]
     late = float(np.sum(off))
     evidence = (f'the attitude follows the gyroscope {abs(late):.3g} samples '
@@ -128,23 +131,22 @@ def delay(exam: Exam) -> Measured:
 
 def steps(exam: Exam) -> Measured:
     """Compare turns in steps of different lengths: most of those of a length are misused."""
-    turns, moves = exam.answers('uneven turns')
-    off = np.linalg.norm(moves[:, 0] - turns, axis=1)
-    of_length = np.resize(STEPS, len(off)) == np.reshape(STEPS, (-1, 1))
-    share = [np.median((off / np.linalg.norm(turns, axis=1))[rows]) for rows in of_length]
-    worst = int(np.argmax(share))
-    evidence = (f'in steps of {1e3 * STEPS[worst]:g} ms {share[worst]:.3g} of a turn is not as '
-                'the gyroscope reads it')
-    turns, moves = exam.answers('turns')
-    equal = np.median(np.linalg.norm(moves[:, 0] - turns, axis=1))
-    if equal > EXPLAINED * np.median(off[of_length[worst]]):
-        return Measured(float(share[worst]), f'{evidence}, nor in equal steps', 'accuracy')
-    return Measured(float(share[worst]), f'{evidence}: the length is misused')
+    lengths = np.resize(STEPS, len(exam.ends))
+    off = np.abs(1.0 - _gains(*exam.answers('uneven turns', SMALL, lengths))[:, 0])
+    of_length = [float(np.median(off[lengths == length])) for length in STEPS]
+    worst = int(np.argmax(of_length))
+    evidence = (f'in steps of {1e3 * STEPS[worst]:g} ms {of_length[worst]:.3g} of a turn is not '
+                'as the gyroscope reads it')
+    # As angles, those in equal steps are as much off if the length is not the cause.
+    equal = np.median(np.abs(1.0 - _gains(*exam.answers())[:, 0])) / (STEPS[worst] * RATE)
+    if equal > EXPLAINED * of_length[worst]:
+        return Measured(of_length[worst], f'{evidence}, nor in equal steps', 'accuracy')
+    return Measured(of_length[worst], f'{evidence}: the length is misused')
 
 
 def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with the closed form."""
-    off = abs(1.0 - float(np.median(_gains(*exam.answers('large turns'))[:, 0])))
+    off = abs(1.0 - float(np.median(_gains(*exam.answers('large turns', LARGE))[:, 0])))
     return Measured(off, f'a turn of {LARGE:g} rad in one step, {LARGE * RATE:g} rad/s, is '
                     f'{off:.2%} off, a small one is not; a step of first order is '
                     f'{LARGE ** 2 / 12.0:.2%} off', 'gyroscope' if off > EXPLAINED else '')
@@ -152,24 +154,33 @@ def large_turns(exam: Exam) -> Measured:
 
 def tilt_answer(exam: Exam) -> Measured:
     """Turn the gyroscope alone about each axis, and across it: gravity leads the tilt back."""
-    (still,), back = exam.outcomes('no field'), []
-    for moved in exam.outcomes('tilts'):
-        last = len(moved.run.dt) - 1
-        first, later = (np.cross(*measures.up(np.stack((moved.estimates[k], still.estimates[k]))))
-                        for k in (last + 1 - 6 * ANSWER, last))
-        back.append(1.0 - float(first @ later) / float(first @ first))
+    up, back = measures.up(exam.run.truth[exam.ends - 1]), []
+    for name, axis in zip(AXES, np.eye(3), strict=True):
+        k = np.argmin(np.abs(up @ axis))        # where it is most level
+        across, rows = np.cross(up[k], axis), np.array((exam.ends[k] - BACK, exam.ends[k] - 1))
+        for kick, how in ((np.cross(across, up[k]), 'about'), (across, 'across')):
+            moved = exam.outcome(f'tilt {how} {name}', exam.kicked(
+                rows[:1], SMALL * kick[np.newaxis]).part(slice(exam.ends[k])))
+            first, later = np.cross(measures.up(moved.estimates[rows]),
+                                    measures.up(exam.still.estimates[rows]))
+            back.append(1.0 - float(first @ later) / float(first @ first))
     share = np.array(back[::2]) / np.maximum(back[1::2], measures.ROUNDING)
     return Measured(1.0 - float(np.min(share)), 'gravity leads a tilt about x, y and z back by '
                     f'{", ".join(f"{one:.2g}" for one in back[::2])} of it within '
-                    f'{6.0 * ANSWER / RATE:g} s, across by '
+                    f'{BACK / RATE:g} s, across by '
                     f'{", ".join(f"{one:.2g}" for one in back[1::2])}')
 
 
 def clean(exam: Exam) -> Measured:
     """Judge what is left without noise; filters may read force and field at the begin of steps."""
-    whole = np.degrees(exam.errors('excitation').whole)
+    settled = slice(exam.lead, None)
+    whole = np.degrees(exam.errors(exam.plain.part(settled)).whole)
     if np.max(whole) > CLEAN_DEG:
-        whole = min(whole, np.degrees(exam.errors('force of the begin').whole), key=np.max)
+        force, field = (np.vstack((rows[:1], rows[:-1]))
+                        for rows in (exam.run.accelerometer, exam.run.magnetometer))
+        early = exam.outcome('force of the begin', replace(
+            exam.run, accelerometer=force, magnetometer=field))
+        whole = min(whole, np.degrees(exam.errors(early.part(settled)).whole), key=np.max)
     parts = exam.motion.parts[1:]           # from when it has settled
     worst = {part.kind: 0.0 for part in parts}
     for kind, begin, end in parts:
@@ -180,8 +191,8 @@ def clean(exam: Exam) -> Measured:
 
 def reported_bias(exam: Exam) -> Measured | None:
     """Judge the bias that is reported, unless it still comes closer to the true one."""
-    (outcome,), off, said = exam.outcomes('bias'), [], []
-    for axes, rows in _of_bias(exam):
+    outcome, off, said = exam.biased, [], []
+    for axes, rows in _of_bias(outcome):
         told = outcome.biases[rows][np.isfinite(outcome.biases[rows][:, 0])]
         if len(told) < 4:           # a quarter of them is the end
             return None
@@ -199,11 +210,11 @@ def reported_bias(exam: Exam) -> Measured | None:
 
 def effect_of_bias(exam: Exam) -> Measured:
     """Judge the tilt by a bias: it ends, or stays where a filter has no estimate."""
-    (outcome,) = exam.outcomes('bias')
+    outcome = exam.biased
     # About axes of the sensor, because the heading may drift.
     tilt = np.abs(np.cross(measures.up(outcome.run.truth), measures.up(outcome.estimates)))
     grows, ends = [], []
-    for axes, rows in _of_bias(exam):
+    for axes, rows in _of_bias(outcome):
         for axis in axes:
             first, second = (float(np.max(part)) for part in np.array_split(tilt[rows, axis], 2))
             grows.append(second / max(first, STILL))
@@ -218,18 +229,26 @@ def heading_answer(exam: Exam) -> Measured | None:
     """Turn the field: the heading follows."""
     if not exam.heading:
         return None
-    (still,), (moved,) = exam.outcomes('excitation'), exam.outcomes('field turned')
-    share = float(errors_of(still.estimates[-1:], moved.estimates[-1:]).heading[0]) / SMALL
+    turns, field = Rotation.from_quat(exam.run.truth), exam.run.magnetometer.copy()
+    middle = len(field) // 2
+    field[middle:] = turns[middle:].inv().apply(Rotation.from_euler('z', SMALL).apply(FIELD))
+    moved = exam.outcome('field turned', replace(exam.run, magnetometer=field))
+    share = float(errors_of(exam.plain.estimates[-1:], moved.estimates[-1:]).heading[0]) / SMALL
     return Measured(1.0 - share, f'of a turn of the field by {degrees(SMALL)} the heading '
                     f'follows {share:.2g} within {len(exam.run.dt) / 2.0 / RATE:.0f} s')
 
 
 def lever_arm(exam: Exam) -> Measured:
     """Move the IMU off the axis: the tilt must not follow the specific force."""
-    ((part,), (with_arm,)) = exam.motion.of('top'), exam.outcomes('lever arm')
+    (part,) = exam.motion.of('top')
+    rows, force = slice(part.begin, part.end), exam.run.accelerometer.copy()
+    turns = Rotation.from_quat(exam.run.truth[rows])
+    velocity = np.gradient(turns.apply(ARM), 1.0 / RATE, axis=0)
+    force[rows] += turns.inv().apply(np.gradient(velocity, 1.0 / RATE, axis=0))
+    with_arm = exam.outcome('lever arm', replace(exam.run, accelerometer=force))
     # When it has come; the last differences are one-sided.
     rows = slice((part.begin + part.end) // 2, part.end - 2)
-    still = exam.outcomes('excitation')[0].estimates[rows]
+    still = exam.plain.estimates[rows]
     tilt = rms(errors_of(with_arm.estimates[rows], still).tilt)
     east, north, up = Rotation.from_quat(exam.run.truth[rows]).apply(
         with_arm.run.accelerometer[rows]).T
@@ -241,8 +260,7 @@ def lever_arm(exam: Exam) -> Measured:
 
 def noisy(exam: Exam) -> Measured:
     """Judge the errors with noise."""
-    errors = [errors_of(one.estimates, one.run.truth) for one in _late(exam)]
-    errors = errors if exam.heading else [one.about_mean() for one in errors]
+    errors = list(map(exam.errors, _late(exam)))
     tilt, heading = (np.degrees(np.concatenate(rows)) for rows in zip(*errors, strict=True))
     value = math.degrees(max(rms(one.whole) for one in errors))
     return Measured(value, f'with noise the error is {value:.3g} deg rms', others={
@@ -277,15 +295,15 @@ def _at_rest(outcomes: Sequence[Outcome], axes: slice) -> float:
         one.run.truth[-1], one.estimates[-1])[axes])) for one in outcomes), default=0.0))
 
 
-def _of_bias(exam: Exam) -> list[tuple[Sequence[int], slice]]:
+def _of_bias(outcome: Outcome) -> list[tuple[Sequence[int], slice]]:
     """Return axes that are level in the rests with a bias, whose errors gravity shows."""
-    n, length = len(exam.outcomes('bias')[0].run.dt), round(BIAS_S * RATE)
+    n, length = len(outcome.run.dt), round(BIAS_S * RATE)
     return [((0, 1), slice(length)), ((1, 2), slice(n - length, n))]
 
 
 def _late(exam: Exam) -> list[Outcome]:
     """Return the second half of the runs with noise, each seed once."""
-    return [one.part(slice(len(one.run.dt) // 2, None)) for one in exam.outcomes('noise')[:-1]]
+    return [one.part(slice(len(one.run.dt) // 2, None)) for one in exam.noise[:-1]]
 
 
 FIRST = 'invalid_output', 'nondeterministic'

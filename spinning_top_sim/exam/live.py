@@ -92,7 +92,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             self._process = subprocess.Popen(self._command, start_new_session=True)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
-        if not self._wait(self.is_there, PATIENCE_S):
+        if not self._wait(lambda: self._imu.get_subscription_count()
+                          and self._node.count_publishers(self._topic), PATIENCE_S):
             raise RuntimeError(
                 f'no node reads {IMU_TOPIC} and publishes {self._topic} within {PATIENCE_S:g} s: '
                 f'check its ROS_DOMAIN_ID ({os.environ.get("ROS_DOMAIN_ID", "0")} here), '
@@ -162,11 +163,6 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         if magnetometer is not None:
             self._field.publish(field)
         self._imu.publish(imu)
-
-    def is_there(self) -> bool:
-        """Return whether a node reads the samples, and one publishes the attitudes."""
-        return bool(self._imu.get_subscription_count()
-                    and self._node.count_publishers(self._topic))
 
     def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""
