@@ -106,6 +106,7 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
     assert report.measures['tilt_rms_deg'] == pytest.approx(math.degrees(0.01 * 2 ** 0.5),
                                                             rel=0.05)
     assert ('nees' in report.measures) == (type_name in (IMU, POSE_COVARIANCE, ODOMETRY))
+    assert report.measures.get('nees', 1.0) == pytest.approx(1.0, rel=0.1)
 
 
 @pytest.mark.parametrize(('name', 'said', 'options'), [

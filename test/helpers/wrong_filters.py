@@ -176,6 +176,8 @@ WRONG = {
     'w first, NED': (partial(Part, said=lambda q: product(NED, q)[[3, 0, 1, 2]]), 'convention'),
     'vector x y -z': (partial(Part, said=lambda q: q * (1.0, 1.0, -1.0, 1.0)), 'convention'),
     'vector positive': (partial(Part, said=np.abs), 'accuracy'),
+    'rounded': (partial(Part, said=lambda q: np.round(q, 3) / np.linalg.norm(np.round(q, 3))),
+                'accuracy'),
     'attitude late': (partial(Part, late=(0, 0, 0, 5)), 'timing'),
     'one step late': (partial(Part, late=(0, 0, 0, 1)), 'timing'),
     'dt of 100 Hz': (partial(Part, Mahony, step=lambda dt: 0.01), 'timing'),
