@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from helpers.wrong_filters import Part, Vqf, product
+from helpers.wrong_filters import Vqf
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import examine
@@ -71,18 +71,6 @@ def test_the_device_errs_by_its_bias_its_bandwidth_and_the_magnet(perfect, monke
     slope = np.diff(exact.accelerometer, axis=0) / exact.dt[0]
     assert np.sum(late * slope) / np.sum(slope ** 2) == pytest.approx(
         1.0 / (40.0 * np.pi), rel=0.15)
-
-
-def test_the_mark_is_the_mean_over_scenes_and_tells_filters_apart(monkeypatch):
-    monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_translation'], BY_NAME['vibration']])
-    turned = partial(Part, Vqf, said=partial(product, Rotation.from_euler(
-        'z', 10.0, degrees=True).as_quat()))
-    good, bad = (examine(make, 'field', seeds=1).measures for make in (Vqf, turned))
-    names = [f'field_rms_{scene.name}_deg' for scene in field.SCENES]
-    assert {*good} == {*names, 'field_rms_deg', 'field_heading_rms_deg', 'field_tilt_rms_deg'}
-    assert good['field_rms_deg'] == pytest.approx(np.mean([good[name] for name in names]))
-    assert good['field_rms_deg'] < 6.0 < bad['field_rms_deg'] < 16.0
-    assert bad['field_tilt_rms_deg'] == pytest.approx(good['field_tilt_rms_deg'])
 
 
 def test_the_level_has_a_verdict(monkeypatch):

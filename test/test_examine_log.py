@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of logs: attitudes of other nodes beside the truth."""
 
-import json
 import math
 import struct
 
@@ -100,14 +99,6 @@ def test_a_chunk_that_cannot_be_read_is_noted_here_and_by_grade(log, tmp_path):
         assert [note for note in read_log(path).notes if 'damaged' in note] == notes
 
 
-def test_damage_is_noted_also_beside_an_invalid_output(beside, tmp_path):
-    content = beside(lambda q: 2.0 * q).read_bytes()
-    (tmp_path / 'cut.mcap').write_bytes(content[:-9])
-    report = examine_log(tmp_path / 'cut.mcap', '/estimate')
-    assert report.faults == ['invalid_output']
-    assert report.notes == ['the log is damaged: what is whole is read']
-
-
 @pytest.mark.parametrize('type_name', TYPES)
 def test_attitudes_of_every_type_are_read(beside, type_name):
     report = examine_log(beside(disturbed, type_name, variance=1e-4), 'estimate', heading='true')
@@ -115,6 +106,7 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
     assert report.measures['tilt_rms_deg'] == pytest.approx(math.degrees(0.01 * 2 ** 0.5),
                                                             rel=0.05)
     assert ('nees' in report.measures) == (type_name in (IMU, POSE_COVARIANCE, ODOMETRY))
+    assert report.measures.get('nees', 1.0) == pytest.approx(1.0, rel=0.1)
 
 
 @pytest.mark.parametrize(('name', 'said', 'options'), [
@@ -144,25 +136,6 @@ def test_a_delay_in_a_log_is_in_steps_of_the_filter(tmp_path):
         '/late', heading='true')
     assert report.faults == ['timing']
     assert report.measures['stamp_offset_s'] == pytest.approx(0.003, rel=0.02)
-
-
-def test_a_truth_of_one_stamp_cannot_be_compared(log, tmp_path):
-    with LogReader(log) as reader:
-        rows = [(k, one.log_time, one.data if k else stamped(one, 0)) for k, name in enumerate(
-            ('/ground_truth/imu', '/imu/data')) for one in reader.messages([name])]
-    path = write_rows(tmp_path / 'still.mcap', [
-        RecordedTopic(name, IMU) for name in ('/ground_truth/imu', '/imu/data')], rows)
-    with pytest.raises(ValueError, match='attitudes at times of the truth: must have 100'):
-        examine_log(path, 'imu/data')
-
-
-def test_the_command_judges_a_log(beside, capsys):
-    bad = beside(lambda q: q * (-1.0, -1.0, -1.0, 1.0))
-    assert main([str(bad), '--topic', '/estimate', '--heading', 'true', '--json']) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert found['faults'] == ['convention'] and not found['passed']
-    assert 'read as conjugated' in found['found'][0]['evidence']
-    assert found['marks']['error_rms_deg']['value'] < 1e-5      # after the correction
 
 
 def test_the_heading_in_a_log_is_right_or_steady(beside):

@@ -26,20 +26,13 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
                  feed: Feed = feed_apart,
                  show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
-    Examine a filter with the trials of BROAD in a folder: .mat.
-
-    The filter gets each trial from its first sample on.  The measures are the root mean squares
-    of the errors in motion, of each trial and their means.
+    Examine a filter with the trials of BROAD in a folder: .mat, each from its first sample on.
 
     Parameters
     ----------
-    make_filter : callable
-        As for `examine`.
     folder : path
         With the trials.
-    subject : str, optional
-        As for `examine`.
-    feed, show : callable, optional
+    make_filter, subject, feed, show
         As for `examine`.
 
     Raises

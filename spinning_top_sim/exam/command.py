@@ -20,10 +20,9 @@ The faults and the measures are defined in docs/exam.md.
 """
 
 import argparse
-import contextlib
 import runpy
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from typing import Any
 from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.broad import examine_data
 from spinning_top_sim.exam.examiner import SEEDS, examine
-from spinning_top_sim.exam.feeding import INTERRUPTED, Filter, feed, feed_apart
+from spinning_top_sim.exam.feeding import Filter, feed, feed_apart
 from spinning_top_sim.exam.programs import Program
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
@@ -78,7 +77,7 @@ def _run(arguments: argparse.Namespace) -> int:
         with needed('a page', 'plot'):
             from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
     judge = _judge(kind, getattr(arguments, kind))
-    with _interruptible(raises=kind != 'node'), cli.progress('examined', 100.0, '%') as bar:
+    with cli.handling(_interrupt), cli.progress('examined', 100.0, '%') as bar:
         if kind != 'log':
             options['show'] = lambda done, total: bar(100.0 * done / total)
         report = judge(**options)
@@ -131,16 +130,9 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
     return judge
 
 
-@contextlib.contextmanager
-def _interruptible(raises: bool) -> Iterator[None]:
+def _interrupt(*_: object) -> None:
     """End the exam, and what it has started, at SIGTERM as at SIGINT."""
-    def interrupt(*_: object) -> None:
-        if raises:
-            raise KeyboardInterrupt
-        INTERRUPTED.set()
-
-    with cli.handling(interrupt):
-        yield
+    raise KeyboardInterrupt
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:

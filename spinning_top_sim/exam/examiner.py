@@ -48,10 +48,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     subject : str, optional
         Name in the report; default: that of the filter's class.
     feed : callable, optional
-        What feeds the filter; `feeding.feed` does it in this process, where a debugger can reach
-        it.
+        `feeding.feed` feeds the filter in this process, where a debugger can reach it.
     show : callable, optional
-        What takes the number of parts done and to do.
+        Takes the number of parts done and to do.
 
     Returns
     -------
@@ -60,15 +59,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Raises
     ------
-    TypeError
-        If `make_filter` cannot be called, such as a filter itself.
     ValueError
         If the level, a parameter or a seed is not allowed.
     """
-    if not callable(make_filter):
-        raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
-                        'filter, a function that returns a new one, or one of '
-                        "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')
@@ -125,8 +118,8 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
                                  measured.value))
     show(len(CHECKS), len(CHECKS))
     notes = [f'not judged because of this: {", ".join(left_out)}'] if left_out else []
-    noise = exam.told.get('noise', ())[:-1]
     absolute = 'no field' not in exam.told or exam.heading
     if not absolute:
         notes.append('the magnetometer changes nothing: tilt and steady heading are judged')
-    return Report(subject, found, marks, notes, list(map(exam.ours, noise)), absolute)
+    noise = exam.noise[:-1] if 'noise' in exam.told else []
+    return Report(subject, found, marks, notes, noise, absolute)

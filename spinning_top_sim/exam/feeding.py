@@ -4,7 +4,6 @@
 import contextlib
 import math
 import signal
-import threading
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,6 @@ READ_EVERY = 10                 # updates after which covariance and bias are re
 TOLERANCE = 1e-3
 ANSWER_S = 5.0                  # a program may take as long for an answer
 UPDATE_S = 0.01                 # an update may take, in the mean, as long as a sample lasts
-INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses KeyboardInterrupts
 
 
 class Filter(Protocol):

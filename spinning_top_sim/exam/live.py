@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -21,21 +22,15 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
-from spinning_top_sim.exam.feeding import ANSWER_S, INTERRUPTED, READ_EVERY, NodeError, feed
+from spinning_top_sim.exam.feeding import ANSWER_S, READ_EVERY, NodeError, feed
 from spinning_top_sim.exam.motions import Reals
 from spinning_top_sim.times import NANOSECONDS, stamp_text
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 from spinning_top_sim.tools.report import Report
 
-try:                            # takes least processor time
-    from rclpy.experimental import EventsExecutor as Executor
-except ImportError:
-    from rclpy.executors import SingleThreadedExecutor as Executor
-
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
-PATIENCE_S = 20.0               # for a node to start
-# The first sample is sent again so often, after this time each: endpoints match within seconds.
-AGAIN, AGAIN_S = 20, 0.3
+PATIENCE_S = 20.0               # for a node to start, and to answer first
+AGAIN_S = 0.3                   # after it, the first sample is sent again
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 NAME, FRAME = 'examine', 'imu_link'
 
@@ -72,7 +67,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         rclpy.init(context=self._context)
         self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
-        self._executor = Executor(context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         # A reliable publisher that keeps messages serves readers of every kind.
         profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -97,7 +92,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             self._process = subprocess.Popen(self._command, start_new_session=True)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
-        if not self._wait(self.is_there, PATIENCE_S):
+        if not self._wait(lambda: self._imu.get_subscription_count()
+                          and self._node.count_publishers(self._topic), PATIENCE_S):
             raise RuntimeError(
                 f'no node reads {IMU_TOPIC} and publishes {self._topic} within {PATIENCE_S:g} s: '
                 f'check its ROS_DOMAIN_ID ({os.environ.get("ROS_DOMAIN_ID", "0")} here), '
@@ -127,7 +123,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         The first ones are published again, later, until there is an answer: the node may not yet
         be matched, or have no step to take.
         """
-        for _ in range(1 if self._answered else AGAIN):
+        for _ in range(1 if self._answered else round(PATIENCE_S / AGAIN_S)):
             self._publish(gyroscope, accelerometer, magnetometer, dt)
             if self._wait(lambda: self._now_ns in self._answers,
                           ANSWER_S if self._answered else AGAIN_S):
@@ -135,7 +131,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         else:
             self._check_alone()
             if not self._answered:
-                raise RuntimeError(f'it answers none of {AGAIN} samples')
+                raise RuntimeError(f'it answers no sample within {PATIENCE_S:g} s')
             raise NodeError(f'no attitude has the stamp {stamp_text(self._now_ns)} s of its '
                             f'sample within {ANSWER_S:g} s: the node hangs, or a message is lost; '
                             f'make {IMU_TOPIC} and {self._topic} reliable there')
@@ -168,18 +164,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             self._field.publish(field)
         self._imu.publish(imu)
 
-    def is_there(self) -> bool:
-        """Return whether a node reads the samples, and one publishes the attitudes."""
-        return bool(self._imu.get_subscription_count()
-                    and self._node.count_publishers(self._topic))
-
     def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""
         end = time.monotonic() + seconds
         while not condition():
-            if INTERRUPTED.is_set():
-                INTERRUPTED.clear()         # so that the end of the node is waited for
-                raise KeyboardInterrupt
             if time.monotonic() > end:
                 return False
             if self._process is not None and self._process.poll() is not None:

@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam.checks import EXPLAINED
 from spinning_top_sim.exam.feeding import Outcome, invalid
-from spinning_top_sim.exam.measures import NEES_OFF, degrees, nees_of, turns
+from spinning_top_sim.exam.measures import NEES_OFF, USELESS_DEG, degrees, nees_of, turns
 from spinning_top_sim.exam.motions import Reals, Run
-from spinning_top_sim.exam.scored import USELESS_DEG
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import stamp_text
 from spinning_top_sim.tools import conventions

@@ -14,6 +14,7 @@ from spinning_top_sim.tools.identify import rms
 
 ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
 NEES_OFF = 4.0, 20.0    # factors by which a covariance may be too small, and on the safe side
+USELESS_DEG = 10.0      # a larger error than that of any published filter with tuned gains
 
 
 def rmse(estimates: Reals, truth: Reals) -> Reals:
@@ -73,19 +74,18 @@ def nees_of(outcomes: Sequence[Outcome]) -> float | None:
     It is 1 if the covariance is consistent.  The covariance may refer to the axes of the sensor or
     of the world: the better one counts.  None: there is no covariance.
     """
-    squares: list[list[float]] = [[], []]
+    squares = []
     for outcome in outcomes:
         one = outcome.part(np.flatnonzero(np.isfinite(outcome.covariances[:, 0, 0])))
         if not len(one.run.dt):
             return None
-        tilt = turns(one.estimates, one.run.truth)[:, :2, np.newaxis]
+        tilt = turns(one.estimates, one.run.truth)[:, :2]
         turn = Rotation.from_quat(one.estimates).as_matrix()
-        for found, p in zip(squares, (one.covariances, turn @ one.covariances @ turn.transpose(
-                0, 2, 1)), strict=True):
-            inverse = np.linalg.pinv(p[:, :2, :2], hermitian=True)
-            found.extend(0.5 * np.squeeze(tilt.transpose(0, 2, 1) @ inverse @ tilt, (1, 2)))
-    return min((max(float(np.mean(one)), ROUNDING) for one in squares),
-               key=lambda ratio: abs(math.log(ratio)))
+        squares.append([np.einsum('ni,nij,nj->n', tilt, np.linalg.pinv(
+            p[:, :2, :2], hermitian=True), tilt) for p in (
+                one.covariances, turn @ one.covariances @ turn.transpose(0, 2, 1))])
+    means = np.maximum(0.5 * np.mean(np.concatenate(squares, axis=1), axis=1), ROUNDING)
+    return float(min(means, key=lambda ratio: abs(math.log(ratio))))
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

@@ -39,10 +39,10 @@ OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
 # slow precession and large nutation.
 WHEEL = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.02, gravity=GRAVITY)
 START = {'theta': 0.7, 'theta_dot': 0.0, 'l3': 0.6, 'lz': 0.6 * math.cos(0.7)}
-TOP_S = 12.0                    # some nutations
-# Yaw, pitch and roll [deg]: near the identity, where many filters start, so that slow ones settle
-# soon; and two more to start from.
-NEAR, STARTS = (4.0, 3.0, -2.5), ((60.0, -35.0, 20.0), (-110.0, 15.0, -50.0))
+TOP_S = 12.0            # some nutations
+# Yaw, pitch and roll to start from [deg]; the first, with which motions begin, is near the
+# identity, where many filters start, so that slow ones settle soon.
+STARTS = (4.0, 3.0, -2.5), (60.0, -35.0, 20.0), (-110.0, 15.0, -50.0)
 # Turns about an axis of the sensor [deg] at a rate [rad/s], each after a rest: those that any
 # filter follows, two as fast as a hand turns, and one so slow that a threshold would drop it.
 # Each axis of the sensor is near the vertical in some rests, upwards and downwards.
@@ -51,7 +51,7 @@ TURNS = (*(('turns', axis, angle, 2.6) for axis, angle in (
     (1, -110.0), (2, -90.0))), ('fast turns', 0, 220.0, 12.0), ('fast turns', 1, -200.0, 12.0),
     ('slow turns', 1, 60.0, 0.15))
 REST_S = 2.5                    # time for answers, and for gravity to lead a tilt back
-STEPS = 0.0025, 0.005, 0.015, 0.0025, 0.0125, 0.005, 0.0025, 0.0075     # uneven ones [s]
+STEPS = 0.0025, 0.005, 0.0125, 0.015    # uneven ones [s]
 NEVER_ZERO = 1e-6       # [rad/s]; some filters take no step while the rates are zero
 
 
@@ -81,7 +81,7 @@ class Run:
 
 
 class Part(NamedTuple):
-    """Samples of a motion: 'rests', 'turns', 'fast turns', 'slow turns', 'top', 'uneven steps'."""
+    """Samples of a motion: 'rests', 'turns', 'fast turns', 'slow turns', 'top'."""
 
     kind: str
     begin: int
@@ -93,26 +93,22 @@ class Motion:
 
     def __init__(self, start: Sequence[float]) -> None:
         self._attitudes = [Rotation.from_euler('ZYX', [start], degrees=True)]
-        self._dt: list[Reals] = []
         self.parts: list[Part] = []
 
     def of(self, kind: str) -> list[Part]:
         """Return the parts of a kind."""
         return [part for part in self.parts if part.kind == kind]
 
-    def add(self, kind: str, attitudes: Rotation,
-            steps: Sequence[float] = (1.0 / RATE,)) -> 'Motion':
-        """Add attitudes at the ends of steps of these lengths, again and again."""
+    def add(self, kind: str, attitudes: Rotation) -> 'Motion':
+        """Add attitudes at the ends of steps."""
         begin = self.parts[-1].end if self.parts else 0
         self.parts.append(Part(kind, begin, begin + len(attitudes)))
         self._attitudes.append(attitudes)
-        self._dt.append(np.resize(steps, len(attitudes)))
         return self
 
-    def rest(self, seconds: float, kind: str = 'rests',
-             steps: Sequence[float] = (1.0 / RATE,)) -> 'Motion':
+    def rest(self, seconds: float) -> 'Motion':
         """Add a rest."""
-        return self.add(kind, self._attitudes[-1][[-1] * round(seconds / np.mean(steps))], steps)
+        return self.add('rests', self._attitudes[-1][[-1] * round(seconds * RATE)])
 
     def turn(self, vector: Sequence[float] | Reals, rate: float = 2.6,
              kind: str = 'turns') -> 'Motion':
@@ -131,19 +127,20 @@ class Motion:
 
     def run(self, name: str) -> Run:
         """Return what a perfect IMU reads, which turns steadily in a step."""
-        attitudes, dt = Rotation.concatenate(self._attitudes), np.concatenate(self._dt)
-        rates = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / dt[:, np.newaxis]
+        attitudes = Rotation.concatenate(self._attitudes)
+        rates = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() * RATE
         to_sensor = attitudes[1:].inv()
-        return Run(name, dt, attitudes[1:].as_quat(), rates + NEVER_ZERO,
-                   to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(FIELD))
+        return Run(name, np.full(len(rates), 1.0 / RATE), attitudes[1:].as_quat(),
+                   rates + NEVER_ZERO, to_sensor.apply((0.0, 0.0, GRAVITY)),
+                   to_sensor.apply(FIELD))
 
 
 def excitation(lead_s: float) -> Motion:
-    """Return turns about each axis between rests, the motion of a top, and uneven steps."""
-    motion = Motion(NEAR).rest(lead_s)
+    """Return turns about each axis between rests, and the motion of a top."""
+    motion = Motion(STARTS[0]).rest(lead_s)
     for kind, axis, angle, rate in TURNS:
         motion.rest(REST_S).turn(np.radians(angle) * np.eye(3)[axis], rate, kind)
-    return motion.rest(REST_S).top(TOP_S).rest(REST_S).rest(REST_S, 'uneven steps', STEPS)
+    return motion.rest(REST_S).top(TOP_S).rest(REST_S)
 
 
 def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: float) -> Run:
@@ -152,15 +149,29 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
 
     Raises ValueError for parameters that are not allowed.
     """
-    run = Motion(NEAR).rest(lead_s).top(seconds, seed).run(name)
-    values = parameters.checked({'mag.field': FIELD, **imu, 'seed': seed})
-    period_ns = round(1e9 / RATE)
-    times = period_ns * np.arange(1, len(run.dt) + 1)
+    run = Motion(STARTS[0]).rest(lead_s).top(seconds, seed).run(name)
+    values = dict(parameters.checked({'mag.field': FIELD, **imu, 'seed': seed}))
     east, north, up = values['mag.field']       # north is magnetic north
-    field: Any = Rotation.from_quat(run.truth).inv().apply((0.0, math.hypot(east, north), up))
-    true: Any = tuple(run.gyroscope.T), tuple(run.accelerometer.T)
-    device, magnetometer = Imu(values, period_ns), Magnetometer(values, period_ns)
-    rates, force, field = (np.stack(columns, axis=1) for columns in (
-        *device.read(true, device.errors(times)),
-        magnetometer.read(tuple(field.T), magnetometer.errors(times))))
+    values['mag.field'] = 0.0, math.hypot(east, north), up
+    period_ns = round(1e9 / RATE)
+    rates, force, field = readings(
+        values, period_ns, run.gyroscope, run.accelerometer, Rotation.from_quat(run.truth),
+        period_ns * np.arange(1, len(run.dt) + 1))
     return replace(run, gyroscope=rates, accelerometer=force, magnetometer=field)
+
+
+def readings(values: Mapping[str, Any], period_ns: int, rates: Reals, force: Reals,
+             turns: Rotation, field_ns: NDArray[np.int64]) -> list[Reals]:
+    """
+    Return what gyroscope, accelerometer and magnetometer read at the ends of steps, (n, 3) each.
+
+    turns, field_ns : attitudes and times of the field that is read (n,)
+    """
+    times = period_ns * np.arange(1, len(rates) + 1)
+    true: Any = tuple(rates.T), tuple(force.T)
+    x, y, z, w = turns.as_quat().T
+    device, magnetometer = Imu(values, period_ns), Magnetometer(values, period_ns)
+    field = magnetometer.read(magnetometer.felt((x, y, z, w), field_ns),
+                              magnetometer.errors(times))
+    return [np.stack(np.broadcast_arrays(*columns), axis=1) for columns in (
+        *device.read(true, device.errors(times)), field)]

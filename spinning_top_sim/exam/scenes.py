@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam.motions import GRAVITY, Reals, Run
+from spinning_top_sim.exam.motions import GRAVITY, Reals, Run, readings
 from spinning_top_sim.exam.scored import ScoredRun
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.felt import Vibration
-from spinning_top_sim.streams.imu import Imu, Magnetometer
 
 # The motion is computed every half step.
 PERIOD_NS = 7_000_000
@@ -155,7 +154,6 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
               ) -> list[Reals]:
     """Return what gyroscope, accelerometer and magnetometer read at the steps, (n, 3) each."""
     t_ns = HALF_NS * np.arange(1, len(rates) + 1)
-    steps = range(PERIOD_NS, int(t_ns[-1]) + 1, PERIOD_NS)
     exact: Any = rates.T, force.T
     signals: Any = np.concatenate([
         np.stack(Vibration(values, name, np.ones_like).add(true, t_ns))
@@ -166,10 +164,5 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
         low_pass = butter(values['imu.bandwidth_order'], 2.0 * HALF * values['imu.bandwidth'])
         signals = lfilter(*low_pass, signals, zi=lfilter_zi(*low_pass) * signals[:, :1])[0]
     late = np.maximum(np.arange(1, len(t_ns), 2) - MAG_LATE, 0)
-    x, y, z, w = turns[late].as_quat().T
-    imu, magnetometer = Imu(values, PERIOD_NS), Magnetometer(values, PERIOD_NS)
-    field = magnetometer.read(magnetometer.felt((x, y, z, w), t_ns[late]),
-                              magnetometer.errors(np.array(steps)))
-    felt: Any = signals[:3, 1::2], signals[3:, 1::2]
-    return [np.stack(np.broadcast_arrays(*reading), axis=1) for reading in (
-        *imu.read(felt, imu.errors(np.array(steps))), field)]
+    return readings(values, PERIOD_NS, signals[:3, 1::2].T, signals[3:, 1::2].T, turns[late],
+                    t_ns[late])

@@ -14,8 +14,6 @@ from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter
 from spinning_top_sim.exam.motions import Run
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
-USELESS_DEG = 10.0      # a larger mean error than that of any published filter with tuned gains
-
 
 class ScoredRun(NamedTuple):
     """A run, and the samples of it whose errors count."""
@@ -51,9 +49,9 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], ScoredRun]], 
     errors = [measures.rmse(one.estimates, one.run.truth) for one in outcomes]
     total, heading, tilt = np.mean(errors, axis=0).tolist()
     judged, name = (total, 'error') if whole else (tilt, 'tilt error')
-    if judged > USELESS_DEG:
+    if judged > measures.USELESS_DEG:
         faults.append(Finding('accuracy', f'the mean {name} is {judged:.3g} deg', judged))
-    limits = (USELESS_DEG, math.nan) if whole else (math.nan, USELESS_DEG)
+    limits = (measures.USELESS_DEG, math.nan) if whole else (math.nan, measures.USELESS_DEG)
     marks = {f'{kind}_rms_deg': Mark(total, limits[0], 'in motion, mean over the runs'),
              f'{kind}_heading_rms_deg': Mark(heading, meaning='heading alone'),
              f'{kind}_tilt_rms_deg': Mark(tilt, limits[1], 'tilt alone')}

@@ -110,10 +110,11 @@ class IntegralInTheWorld(Mahony):
     """Keeps its integral in axes of the world, and says it in those of the sensor."""
 
     def update(self, *readings):
-        if self._q is not None:
-            self.bias = reference.matrix_of(self._q).T @ self._kept
+        before = self._q
         said = super().update(*readings)
-        self._kept = reference.matrix_of(said) @ self.bias
+        if before is not None:
+            turn = reference.matrix_of(said).T @ reference.matrix_of(before)
+            self.bias = turn @ self.bias
         return said
 
 
@@ -175,6 +176,8 @@ WRONG = {
     'w first, NED': (partial(Part, said=lambda q: product(NED, q)[[3, 0, 1, 2]]), 'convention'),
     'vector x y -z': (partial(Part, said=lambda q: q * (1.0, 1.0, -1.0, 1.0)), 'convention'),
     'vector positive': (partial(Part, said=np.abs), 'accuracy'),
+    'rounded': (partial(Part, said=lambda q: np.round(q, 3) / np.linalg.norm(np.round(q, 3))),
+                'accuracy'),
     'attitude late': (partial(Part, late=(0, 0, 0, 5)), 'timing'),
     'one step late': (partial(Part, late=(0, 0, 0, 1)), 'timing'),
     'dt of 100 Hz': (partial(Part, Mahony, step=lambda dt: 0.01), 'timing'),
