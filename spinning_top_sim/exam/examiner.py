@@ -59,9 +59,15 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Raises
     ------
+    TypeError
+        If `make_filter` cannot be called, such as a filter itself.
     ValueError
         If the level, a parameter or a seed is not allowed.
     """
+    if not callable(make_filter):
+        raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
+                        'filter, a function that returns a new one, or one of '
+                        "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')

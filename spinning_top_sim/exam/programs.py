@@ -84,7 +84,10 @@ class Program:
         return found['attitude']
 
     def _fail(self) -> NoReturn:
-        code = self._process.wait(ANSWER_S)     # or it has closed its input or output
+        try:
+            code = self._process.wait(ANSWER_S)
+        except subprocess.TimeoutExpired:
+            raise InvalidOutputError('the program has closed its input or output') from None
         raise InvalidOutputError(f'the program has ended, {"signal" if code < 0 else "exit code"} '
                                  f'{abs(code)}')
 
