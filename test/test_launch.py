@@ -140,12 +140,12 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(tmp_path):
     assert simulate.main(['-o', str(log), '--quiet', '--duration', '1', '--namespace', '/a/b',
                           '-p', 'body_frame:=wheel', '-p', 'imu.lever_arm:=[0.1,0.2,0.3]']) == 0
     run = started('replay', file=str(log), rate='2', start='0.5', loop='true',
-                  rviz='true')
+                  clock='40', rviz='true')
     parser = ArgumentParser()
     replay_node.add_arguments(parser)
     options = parser.parse_args(run['replay_node'].arguments)
     assert (options.file, options.rate, options.start, options.loop, options.clock,
-            options.partial) == (log, 2.0, 0.5, True, None, False)
+            options.partial) == (log, 2.0, 0.5, True, 40.0, False)
     tf = run['robot_state_publisher']
     assert links_of(tf)[:4] == ['world', 'a/b/precession_link', 'a/b/nutation_link', 'a/b/wheel']
     assert 'xyz="0.1 0.2 0.3"' in tf.parameters[0]['robot_description'].args[0]
