@@ -212,13 +212,14 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_pat
 
 @pytest.mark.parametrize(('changes', 'said'), [
     ({'sample': {'spin.l4': {'uniform': [1, 2]}}},
-     'there is no parameter spin.l4; did you mean spin.l'),
+     'spin.l4: there is no such parameter; did you mean spin.l'),
     ({'params': ['none.yaml']}, 'none.yaml: No such file'),
+    ({'sample': {'params': {'uniform': [1, 2]}}}, 'there is no such parameter'),
     ({'sample': {'spin.l3': {'gauss': [1, 2]}}}, 'must be one of uniform, normal, log_uniform'),
     ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, 'uniform = [2, 1]: must be [low, high] with'),
     ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
     ({'sample': {'markers.trace_points': {'uniform': [1, 2]}}}, 'must be values'),
-    ({'sample': {'use_sim_time': {'values': [True]}}}, 'must be a parameter of the simulation'),
+    ({'sample': {'use_sim_time': {'values': [True]}}}, 'there is no such parameter'),
     ({'streams': ['imu', 'markers']}, 'must be one of pose'),
     ({'streams': [], 'params': [{'record.streams': ['clock']}]}, 'no stream is enabled'),
     ({'run': 3}, 'must be a mapping with runs'), ({'--workers': '0'}, '--workers 0: must be')])

@@ -11,7 +11,7 @@ from spinning_top_sim import scene as api_scene
 from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools.scene_file import parse_assignment, parse_yaml, read_scene
 from spinning_top_sim.tools.simulate import main
 
 VALUES = ['1e-9', '1e5', '-1E+5', '1.5', '.5', '5.', '+5', '-3', '010', '08', '0x1F', '0', '1_000',
@@ -52,7 +52,7 @@ def test_values_have_the_types_that_rcl_finds(tmp_path):
     path = scene(tmp_path / 'p.yaml', **{f'p{k}': text for k, text in enumerate(VALUES)})
     with ros_node(path) as node:
         theirs = [node.get_parameter(f'p{k}').value for k in range(len(VALUES))]
-    ours = [parse_assignment(f'world_frame:={text}')[1] for text in VALUES]
+    ours = [parse_yaml(text, text) for text in VALUES]
     assert list(zip(VALUES, map(repr, ours), strict=True)) == list(
         zip(VALUES, map(repr, theirs), strict=True))
 
@@ -60,13 +60,13 @@ def test_values_have_the_types_that_rcl_finds(tmp_path):
 def test_a_number_in_quotes_is_a_number_where_a_double_is_wanted(tmp_path):
     """YAML 1.1, of `ros2 param set`, takes 1e-9 for a text; the rule is the same for all."""
     for text, value in (("'1e-9'", 1e-9), ("'3.5'", 3.5), ('3', 3.0)):
-        assert parse_assignment(f'solver.rtol:={text}')[1] == value
-        assert read_scene(scene(tmp_path / 'p.yaml', **{'solver.rtol': text})) == {
-            'solver.rtol': value}
-    assert parse_assignment("imu.lever_arm:=['1e-2', '2E0', '.5e3']")[1] == [0.01, 2.0, 500.0]
+        assert parse_assignment(f'spin.l3:={text}')[1] == value
+        assert read_scene(scene(tmp_path / 'p.yaml', **{'spin.l3': text})) == {'spin.l3': value}
+        assert parameters.checked({'spin.l3': yaml.safe_load(text)})['spin.l3'] == value
+    assert parse_assignment("imu.lever_arm:=['1e-2', '2E0', '.5e3']")[1] == (0.01, 2.0, 500.0)
     assert parse_assignment("world_frame:='1e9'")[1] == '1e9'
-    with pytest.raises(ValueError, match=r"solver\.rtol = 'much': must be a number"):
-        parameters.checked(read_scene(scene(tmp_path / 'q.yaml', **{'solver.rtol': 'much'})))
+    with pytest.raises(ValueError, match=r"q\.yaml: spin\.l3 = 'much': must be a number"):
+        read_scene(scene(tmp_path / 'q.yaml', **{'spin.l3': 'much'}))
 
 
 @pytest.mark.parametrize('text', REFUSED)

@@ -67,7 +67,7 @@ def test_commands_at_one_time_are_applied_in_the_order_given_also_at_the_end(tmp
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    (['--scene', 'cups'], '--scene cups: must be the path of a file, or one of braking, cusp'),
+    (['--scene', 'cups'], 'scene cups: must be the path of a file, or one of braking, cusp'),
     (['--params', '/nowhere.yaml'], 'spinning-top simulate: /nowhere.yaml: No such file'),
     (['--duration', '1', '-o', '/nowhere/run.mcap'], 'spinning-top simulate: '
      'cannot write /nowhere/run.mcap: No such file or directory\n'),

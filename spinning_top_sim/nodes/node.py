@@ -56,7 +56,7 @@ class Simulator(Node):
         self.set_descriptor('use_sim_time', ParameterDescriptor(
             read_only=True, dynamic_typing=True))
         simulation = self.simulation = LiveSimulation(values)
-        self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
+        self.add_pre_set_parameters_callback(ros_parameters.all_with_types)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._topics = publishers.ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)

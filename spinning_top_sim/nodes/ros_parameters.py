@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter table as ROS parameters: descriptors, start values, and checked changes."""
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect, Parameter
-from spinning_top_sim.tools.scene_file import OF_RCLPY, likely_name, with_doubles
+from spinning_top_sim.tools.scene_file import OF_RCLPY, likely_name
 
 SPIN = ('spin.l3', 'spin.lz')
 
@@ -41,7 +42,7 @@ def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) 
     values = dict(given)
     for name, value in overrides.items():
         if name in parameters.BY_NAME:
-            values[name] = with_doubles(name, value)
+            values[name] = value
         elif not name.startswith('qos_overrides.'):
             node.get_logger().warning(
                 f'there is no parameter {name}: ignored{likely_name(name)}')
@@ -81,9 +82,15 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
         **ranges)
 
 
-def all_with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """Return parameters whose values are as `with_doubles` returns them."""
-    return [RosParameter(one.name, value=with_doubles(one.name, one.value)) for one in given]
+def all_with_types(given: Sequence[RosParameter]) -> list[RosParameter]:
+    """Return parameters with the types of the table; what is not allowed stays, to be refused."""
+    return [RosParameter(one.name, value=_with_type(one.name, one.value)) for one in given]
+
+
+def _with_type(name: str, value: Any) -> Any:
+    with contextlib.suppress(KeyError, ValueError):
+        value = parameters.BY_NAME[name].check(value)
+    return list(value) if isinstance(value, tuple) else value
 
 
 def is_command(changes: Mapping[str, Any]) -> bool:

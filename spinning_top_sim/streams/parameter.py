@@ -99,23 +99,32 @@ class Parameter:
         return f'must be {what}' + (f' {self.range}' if self.range is not ANY else '')
 
     def check(self, value: Any) -> Any:
-        """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
+        """
+        Return the value in the type of the default.  Raises ValueError if it is not allowed.
+
+        Integers and texts of numbers become doubles, for YAML 1.1, as in `ros2 param set`, takes
+        1e-9 for a text.
+        """
         if value is None and self.default is None:
             return None
-        with contextlib.suppress(TypeError, OverflowError):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
             if not self.is_list:
-                if self._allows(value):
-                    return self.kind(value)
+                return self._one(value)
             # These are iterable, but not lists.
-            elif not isinstance(value, str | bytes | Mapping | Set) and (
+            if not isinstance(value, str | bytes | Mapping | Set) and (
                     self.kind is str or len(value) == len(self.default)
-                    or (self.repeated and len(value) and not len(value) % len(self.default))
-            ) and all(map(self._allows, value)):
-                return tuple(map(self.kind, value))
+                    or (self.repeated and len(value) and not len(value) % len(self.default))):
+                return tuple(map(self._one, value))
         raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
-    def _allows(self, item: Any) -> bool:
-        """Return whether a value, or an item of a list, is allowed."""
+    def _one(self, item: Any) -> Any:
+        """Return a value, or an item of a list, in its type.  Raises ValueError."""
+        if self.kind is float and isinstance(item, str):
+            item = float(item)
         if self.kind in (bool, str):
-            return isinstance(item, self.kind) and (not self.choices or item in self.choices)
-        return item in self.range and (self.kind is float or isinstance(item, int))
+            allowed = isinstance(item, self.kind) and (not self.choices or item in self.choices)
+        else:
+            allowed = item in self.range and (self.kind is float or isinstance(item, int))
+        if not allowed:
+            raise ValueError
+        return self.kind(item)

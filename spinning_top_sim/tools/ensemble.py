@@ -22,7 +22,6 @@ import concurrent.futures
 import contextlib
 import json
 import logging
-import os
 import platform
 import signal
 import sys
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     import distributed
 
 MANIFEST = 'manifest.json'
-LOOPBACK = '127.0.0.1'
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 CONFIGURATION = {
     'distributed.worker.profile.enabled': False,        # it grows with time
@@ -49,6 +47,9 @@ CONFIGURATION = {
     # of the time of a run.  Variables of the environment go first.
     'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2 ** 26,
     'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2 ** 25}
+# No dashboard, and no port that other machines can reach.
+LOCAL = {'threads_per_worker': 1, 'host': '127.0.0.1', 'dashboard_address': '127.0.0.1:0',
+         'scheduler_kwargs': {'dashboard': False}, 'silence_logs': logging.CRITICAL}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -142,23 +143,17 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator['distributed
 
     for handler in logging.getLogger('distributed').handlers:
         handler.setLevel(logging.CRITICAL)          # errors are raised by the client
+    local = {} if scheduler else {**LOCAL, 'n_workers': workers}
+    resource_tracker.ensure_running()       # if it started later, it would unblock SIGINT
     with contextlib.ExitStack() as stack:
-        address: Any = scheduler
-        if scheduler is None:
-            stack.enter_context(dask.config.set(CONFIGURATION))
-            resource_tracker.ensure_running()   # if it started later, it would unblock SIGINT
-            # A terminal sends Ctrl-C to the workers, too, but only this process reacts.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                # No dashboard, and no port that other machines can reach.
-                address = stack.enter_context(distributed.LocalCluster(
-                    n_workers=workers or len(os.sched_getaffinity(0)), threads_per_worker=1,
-                    host=LOOPBACK, dashboard_address=f'{LOOPBACK}:0',
-                    scheduler_kwargs={'dashboard': False}, silence_logs=logging.CRITICAL))
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        client = stack.enter_context(distributed.Client(
-            address, timeout=CONNECT_S, set_as_default=False))
+        stack.enter_context(dask.config.set(CONFIGURATION))
+        # A terminal sends Ctrl-C to the workers, too, but only this process reacts.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            client = stack.enter_context(distributed.Client(
+                scheduler, timeout=CONNECT_S, set_as_default=False, **local))
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         client.wait_for_workers(1, FIRST_WORKER_S)
         yield client
 

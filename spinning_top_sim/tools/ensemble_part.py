@@ -7,8 +7,7 @@ A file gets its name when it is whole.  One that is there already is not compute
 
 import contextlib
 import json
-from collections.abc import Sequence
-from itertools import chain
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -31,27 +30,21 @@ DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
 FAILED_KEY = b'failed'
 # Names of the numbers in fields of messages, where they are not x, y, z and w.
-ARRAYS = {'~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING}
-LABELS = {('sensor_msgs/msg/JointState', 'position'): JOINTS,
-          ('sensor_msgs/msg/JointState', 'velocity'): JOINTS,
-          ('sensor_msgs/msg/NavSatFix', 'position'): ('latitude', 'longitude', 'altitude')}
+LABELS: Mapping[tuple[str, str], Sequence[str]] = {
+    ('~/invariants', 'data'): INVARIANTS, ('ground_truth/imu_timing', 'data'): TIMING,
+    ('joint_states', 'position'): JOINTS, ('joint_states', 'velocity'): JOINTS,
+    **dict.fromkeys([('gnss/fix', 'position'), ('ground_truth/gnss/fix', 'position')],
+                    ('latitude', 'longitude', 'altitude'))}
 
 
 def _column_names(channel: Channel) -> list[str]:
     """Return the names of the numbers in the fields of a message."""
     names = []
     for name, count, _ in channel.template.fields:
-        labels: Any = (
-            ARRAYS.get(channel.topic) or LABELS.get((channel.type_name, name))
-            or ([''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count)))
+        labels = LABELS.get((channel.topic, name)) or (
+            [''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count))
         names += [f'{channel.topic}.{name}.{label}'.rstrip('.') for label in labels]
     return names
-
-
-def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return arrays one after the other in their last axis."""
-    return parts[0] if len(parts) == 1 else np.concatenate(
-        [*parts] or [np.empty(0, np.int64)], axis=-1)
 
 
 def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
@@ -69,16 +62,16 @@ def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
     simulation = Simulation(values, EPOCH_NS)
     kept = [channel for channel in simulation.channels if channel.name in specification.kept]
     names = {channel.topic: _column_names(channel) for channel in kept}
-    times: dict[str, list[Times]] = {topic: [] for topic in names}
-    sent: dict[str, list[NDArray[np.float64]]] = {topic: [] for topic in names}
+    times: dict[str, list[Times]] = {topic: [np.empty(0, np.int64)] for topic in names}
+    sent: dict[str, list[NDArray[np.float64]]] = {
+        topic: [np.empty((len(labels), 0))] for topic, labels in names.items()}
     for block in simulation.play(recorded(kept, values),
                                  round(values['duration'] * NANOSECONDS)):
         for channel, times_ns, rows in block.messages:
             times[channel.topic].append(times_ns)
             sent[channel.topic].append(np.hstack(channel.template.decode(rows)).T)
-    # Faster than np.unique, for they are sorted in parts.
-    every_ns = np.sort(_joined([*chain(*times.values())]), kind='stable')
-    rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
+    known_ns = {topic: np.concatenate(parts) for topic, parts in times.items()}
+    rows_ns = np.unique(np.concatenate([*known_ns.values()]))
 
     def repeated(value: Any) -> 'pyarrow.Array':
         # An unset value (spin.lz) is a null of the type that the other runs have.
@@ -87,14 +80,11 @@ def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
     columns = {'run': repeated(run), 't': pa.array(rows_ns / NANOSECONDS),
                **{name: repeated(value) for name, value in drawn.items()}}
     for topic, labels in names.items():
-        times_ns, absent = _joined(times[topic]), None
-        cells = _joined(sent[topic] or [np.empty((len(labels), 0))])
-        if not np.array_equal(times_ns, rows_ns):
-            # A faulty sensor sends some samples twice; they share a row.
-            present, known = np.searchsorted(rows_ns, times_ns), cells
-            cells, absent = np.zeros((len(labels), len(rows_ns))), np.ones(len(rows_ns), bool)
-            cells[:, present], absent[present] = known, False
-        columns.update((label, pa.array(column, mask=absent))
+        # A faulty sensor loses some samples, and sends some twice, which share a row.
+        present = np.searchsorted(rows_ns, known_ns[topic])
+        cells, absent = np.zeros((len(labels), len(rows_ns))), np.ones(len(rows_ns), bool)
+        cells[:, present], absent[present] = np.concatenate(sent[topic], axis=1), False
+        columns.update((label, pa.array(column, mask=absent if absent.any() else None))
                        for label, column in zip(labels, cells, strict=True))
     return pa.table(columns)
 

@@ -14,7 +14,7 @@ import numpy as np
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters, topics
 from spinning_top_sim.streams.parameter import Parameter, Range
-from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
+from spinning_top_sim.tools.scene_file import likely_name, parse_section, parse_yaml, read_scene
 
 DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
 # Streams that a table can have; only a log has the others.
@@ -125,8 +125,8 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     """
     Return a checked specification from a mapping with the fields of `Specification`.
 
-    A set of parameters may be given as the path of a parameter file, in `folder` or else in the
-    working directory.  `dataclasses.asdict` of a specification can be parsed again.
+    A set of parameters may be given as the path of a parameter file, relative to `folder`.
+    `dataclasses.asdict` of a specification can be parsed again.
     Raises OSError, or ValueError, which names the source, the value and what is allowed.
     """
     known = [one.name for one in fields(Specification)]
@@ -152,28 +152,24 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
 
 def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
     if isinstance(given, str):
-        beside = folder / given
-        found = read_scene(beside if beside.exists() else given)
-    elif isinstance(given, Mapping):
-        found = parse_section(given, what)
-    else:
-        raise ValueError(f'{what}: {shown(given)}: must be a parameter file, or parameters and '
-                         'their values')
-    return {name: parameters.BY_NAME[name].check(value) for name, value in found.items()}
+        return read_scene(folder / given)
+    if isinstance(given, Mapping):
+        return parse_section(given, what)
+    raise ValueError(f'{what}: {shown(given)}: must be a parameter file, or parameters and their '
+                     'values')
 
 
 def _rule(name: str, rule: object, folder: Path) -> dict[str, list[Any]]:
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
     what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
-    if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= {*kinds}:
+    kind, items = next(iter(rule.items())) if isinstance(rule, Mapping) and len(rule) == 1 else (
+        None, None)
+    if kind not in kinds or not isinstance(items, list | tuple) or not items:
         raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
-    (kind, items), = rule.items()
-    if not isinstance(items, list | tuple) or not items:
-        raise ValueError(f'{what}: {kind} = {shown(items)}: must be a list with an item')
-    if name == PARAMS:
-        return {VALUES: [_parameter_set(one, what, folder) for one in items]}
-    if not parse_section({name: 0.0}, 'sample'):        # which raises for an unknown name
-        raise ValueError(f'{what}: must be a parameter of the simulation')
+    if name == PARAMS and kind == VALUES:
+        return {kind: [_parameter_set(one, what, folder) for one in items]}
+    if name not in parameters.BY_NAME:
+        raise ValueError(f'{what}: there is no such parameter{likely_name(name)}')
     parameter = parameters.BY_NAME[name]
     if kind == VALUES:
         return {kind: [*map(parameter.check, items)]}

@@ -2,8 +2,6 @@
 """Reads ROS 2 parameter files and assignments (NAME:=VALUE) without ROS."""
 
 import argparse
-import array
-import contextlib
 import difflib
 import re
 import textwrap
@@ -19,6 +17,7 @@ from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli
 
+KINDS = {'scene': 'top and start of a scene', 'imu': 'errors of an IMU'}
 NODE = '/spinning_top'      # the full name of the node where no other is asked for
 # Parameters that rclpy declares for every node, and those that it declares for publishers.
 OF_RCLPY = 'use_sim_time', 'start_type_description_service'
@@ -52,12 +51,11 @@ for _type, _pattern in (
 
 def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
     """Add the options --scene and --imu, or one of them."""
-    for kind, what in (('scene', 'top and start of a scene'), ('imu', 'errors of an IMU')):
-        if kind in (kinds or ('scene', 'imu')):
-            parser.add_argument(
-                f'--{kind}', metavar='NAME', type=partial(_name, kind), help=f'{what}: the '
-                'name of one that is installed, or the path of a parameter file; "help" lists '
-                'the names')
+    for kind in kinds or KINDS:
+        parser.add_argument(
+            f'--{kind}', metavar='NAME', type=partial(_name, kind), help=f'{KINDS[kind]}: the '
+            'name of one that is installed, or the path of a parameter file; "help" lists the '
+            'names')
 
 
 def _name(kind: str, text: str) -> str:
@@ -102,7 +100,7 @@ def default_text(name: str) -> object:
 def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = False,
           ) -> dict[str, object]:
     """
-    Return the parameters that these options give to a node, not checked; the last value holds.
+    Return the parameters that these options give to a node, each checked; the last value holds.
 
     A namespace is also the prefix of all frames but the world: several tops share one TF tree.
 
@@ -119,9 +117,9 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     namespace = (getattr(arguments, 'namespace', None) or '').strip('/')
     if namespace and not to_ros:
         for name in parameters.FRAMES[1:]:
-            frame = values.get(name, parameters.BY_NAME[name].default)
+            frame = str(values.get(name, parameters.BY_NAME[name].default))
             # With a prefix, what is no name of a frame would look like one.
-            if isinstance(frame, str) and frame and not frame.startswith('/'):
+            if frame and not frame.startswith('/'):
                 values[name] = f'{namespace}/{frame}'
     return values
 
@@ -137,7 +135,7 @@ def file_of(kind: str, name: str) -> Path:
     """Return a file of the kind scene or imu, given by path or name.  Raises ValueError."""
     files = parameter_files(kind)
     if name not in files and '/' not in name and not name.endswith('.yaml'):
-        raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
+        raise ValueError(f'{kind} {name}: must be the path of a file, or one of '
                          f'{", ".join(files)}{likely_name(name, files)}')
     return files.get(name, Path(name))
 
@@ -158,11 +156,7 @@ def scene(name: str) -> tuple[Top, State]:
     ValueError
         For a name that is not known, a wrong file, or a scene whose pivot moves.
     """
-    try:
-        path = file_of('scene', str(name))
-    except ValueError as error:         # which names the option
-        raise ValueError(str(error).removeprefix('--')) from None
-    values = parameters.checked(read_scene(path))
+    values = parameters.checked(read_scene(file_of('scene', str(name))))
     if parameters.pivot_path(values) is not None:
         raise ValueError(f'scene {name}: its pivot moves, which `solve` does not know; '
                          f'see spinning-top simulate --scene {name}')
@@ -171,7 +165,7 @@ def scene(name: str) -> tuple[Top, State]:
 
 def read_scene(path: str | Path, node: str = NODE, *, to_ros: bool = False) -> dict[str, object]:
     """
-    Return the parameters of a node in a ROS 2 parameter file, not checked.
+    Return the parameters of a node in a ROS 2 parameter file, each checked.
 
     Sections are matched as by rcl: `/**`, `/left/*`, `left: spinning_top:`.  A section
     `spinning_top` or with the last part of the node's name applies in any namespace.
@@ -208,18 +202,32 @@ def _fits(section: str, node: str) -> bool:
 
 def parse_section(section: Mapping[object, object], source: str, *, to_ros: bool = False,
                   ) -> dict[str, object]:
-    """Return the parameters in a mapping, not checked.  Raises ValueError, as `read_scene`."""
-    return {name: value if to_ros else _known(name, value, source)
-            for name, value in _flatten(section) if is_of_ros(name) == to_ros}
+    """Return the parameters in a mapping, each checked.  Raises ValueError, as `read_scene`."""
+    return {name: _checked(name, value, source) for name, value in _flatten(section)
+            if is_of_ros(name) == to_ros}
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
-    """Return the name and the value, which is YAML, of NAME:=VALUE.  Raises ValueError."""
+    """Return name and checked value, which is YAML, of NAME:=VALUE.  Raises ValueError."""
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    value = parse_yaml(yaml_text, text)
-    return name, value if is_of_ros(name) else _known(name, value, text)
+    return name, _checked(name, parse_yaml(yaml_text, text), text)
+
+
+def _checked(name: str, value: object, source: str) -> object:
+    """Return the value of a parameter of a source, checked unless rclpy declares it."""
+    try:
+        if value is None or (isinstance(value, list) and len(set(map(type, value))) > 1):
+            raise ValueError(f'{name} = {shown(value)}: must be a value, or a list of values of '
+                             'one type, such as [0.0, 1.5]')
+        if is_of_ros(name):
+            return value
+        if name not in parameters.BY_NAME:
+            raise ValueError(f'there is no parameter {name}{likely_name(name)}')
+        return parameters.BY_NAME[name].check(value)
+    except ValueError as error:
+        raise ValueError(f'{source}: {error}') from None
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:
@@ -249,31 +257,3 @@ def likely_name(name: str, known: Iterable[str] = parameters.BY_NAME, prefix: st
     near = difflib.get_close_matches(asked, names, 1) or [
         one for one in names if all(word in one for word in re.split('[._]', asked))][:3]
     return f'; did you mean {" or ".join(prefix + one for one in near)}?' if near else ''
-
-
-def _known(name: str, value: object, source: str) -> object:
-    """Return the value of a parameter, with doubles.  Raises ValueError for an unknown one."""
-    if name not in parameters.BY_NAME:
-        raise ValueError(f'{source}: there is no parameter {name}{likely_name(name)}')
-    if value is None:
-        raise ValueError(f'{source}: {name} has no value')
-    if isinstance(value, list) and len(set(map(type, value))) > 1:
-        raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have one '
-                         'type, such as [0.0, 1.5]')
-    return with_doubles(name, value)
-
-
-def with_doubles(name: str, value: Any) -> Any:
-    """
-    Return the value of a parameter with doubles for integers and texts where it has doubles.
-
-    YAML 1.1, as in `ros2 param set`, takes 1e-9 for a text.  What is no number stays.
-    """
-    if name in parameters.BY_NAME and parameters.BY_NAME[name].kind is float:
-        if isinstance(value, list | array.array):
-            items = [with_doubles(name, item) for item in value]
-            return items if len(set(map(type, items))) == 1 else value
-        if type(value) in (int, str):
-            with contextlib.suppress(ValueError, OverflowError):
-                return float(value)
-    return value
