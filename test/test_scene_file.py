@@ -103,20 +103,15 @@ def test_a_section_applies_to_the_nodes_that_rcl_applies_it_to(tmp_path, node):
             assert read_scene(path, node) == {'world_frame': 'map'}, section
 
 
-def test_a_namespace_is_the_prefix_of_frames_but_the_world(tmp_path):
-    path = tmp_path / 'left.mcap'
-    assert main(['--namespace', '/left/', '-p', 'imu.frame_id:=chip', '--duration', '1', '--quiet',
-                 '-o', str(path)]) == 0
+def test_a_namespace_is_the_prefix_of_frames_but_the_world_and_of_nothing_else(tmp_path, capsys):
+    path, options = tmp_path / 'left.mcap', ['--namespace', '/left/', '--duration', '1', '--quiet']
+    for frame in ('5', "''", '/chip'):
+        assert main([*options, '-p', f'imu.frame_id:={frame}', '-o', str(path)]) == 2
+        assert 'imu.frame_id = ' in capsys.readouterr().err
+    assert main([*options, '-p', 'imu.frame_id:=chip', '-o', str(path)]) == 0
     with LogReader(path) as log:
         values = json.loads(log.metadata['spinning_top_sim']['parameters'])
     assert [values[name] for name in parameters.FRAMES] == ['world', 'left/base_link', 'left/chip']
-
-
-@pytest.mark.parametrize('frame', ['5', "''", '/chip'])
-def test_a_namespace_makes_no_frame_of_what_is_none(tmp_path, capsys, frame):
-    assert main(['--namespace', 'left', '-p', f'imu.frame_id:={frame}', '--duration', '1',
-                 '-o', str(tmp_path / 'log.mcap')]) == 2
-    assert 'imu.frame_id = ' in capsys.readouterr().err
 
 
 def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(tmp_path):

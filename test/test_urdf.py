@@ -13,6 +13,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Mounting
 from spinning_top_sim.streams.topics import JOINTS
 from spinning_top_sim.tools import urdf
+from spinning_top_sim.tools.export import model
 
 pytest.importorskip('xacro')
 MOUNTED = {'imu.lever_arm': (0.1, -0.05, 0.3), 'imu.rpy': (0.3, -0.2, 1.1)}
@@ -53,10 +54,10 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path):
 
 @pytest.mark.parametrize(('name', 'value'), [
     ('top.mass', 0.0), ('top.com_distance', 1.0), ('top.lambda3', 0.1561)])
-def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name, value):
+def test_an_inertia_that_no_body_has_is_left_out_and_makes_no_model_of_an_engine(name, value):
     assert '<inertial' not in described({name: value})
-    warning = urdf.inertia_fault(parameters.checked({name: value}))
-    assert f'{name} = {value!r}' in warning and 'lambda3 <= 2' in warning
+    with pytest.raises(ValueError, match=f'{name} = {value!r}.* no rigid body .* lambda3 <= 2'):
+        model(parameters.checked({name: value}), 'mjcf', 'top')
 
 
 def test_the_plain_file_is_written_from_the_xacro_file():

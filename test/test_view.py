@@ -300,7 +300,7 @@ sys.exit(main(['view', '--scene', 'wavy', '--html', {str(path)!r}, '-p', 'durati
     (['LOG', '--node'], '--node: cannot be given for a log'),
     (['--namespace', 'left'], '--namespace: cannot be given for a simulation'),
     (['--ros-args', '-r', '__ns:=/left'], '--ros-args -r __ns:=/left: must be with --node'),
-    (['-p', 'top.mas:=3'], 'top.mas:=3: there is no parameter top.mas; did you mean top.mass?'),
+    (['-p', 'top.mas:=3'], 'there is no parameter top.mas; did you mean top.mass?'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
     with pytest.raises(SystemExit, match='2'):       # as argparse ends

@@ -99,12 +99,7 @@ class Parameter:
         return f'must be {what}' + (f' {self.range}' if self.range is not ANY else '')
 
     def check(self, value: Any) -> Any:
-        """
-        Return the value in the type of the default.  Raises ValueError if it is not allowed.
-
-        Integers and texts of numbers become doubles, for YAML 1.1, as in `ros2 param set`, takes
-        1e-9 for a text.
-        """
+        """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
         if value is None and self.default is None:
             return None
         with contextlib.suppress(TypeError, ValueError, OverflowError):
@@ -120,11 +115,9 @@ class Parameter:
     def _one(self, item: Any) -> Any:
         """Return a value, or an item of a list, in its type.  Raises ValueError."""
         if self.kind is float and isinstance(item, str):
-            item = float(item)
-        if self.kind in (bool, str):
-            allowed = isinstance(item, self.kind) and (not self.choices or item in self.choices)
-        else:
-            allowed = item in self.range and (self.kind is float or isinstance(item, int))
-        if not allowed:
-            raise ValueError
-        return self.kind(item)
+            item = float(item)      # YAML 1.1, as in `ros2 param set`, takes 1e-9 for a text
+        if isinstance(item, (int, float) if self.kind is float else self.kind) and (
+                item in self.choices if self.choices
+                else self.kind in (bool, str) or item in self.range):
+            return self.kind(item)
+        raise ValueError

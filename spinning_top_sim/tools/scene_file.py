@@ -110,7 +110,9 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     Raises as `read_scene`.
     """
     values: dict[str, object] = {}
-    for path in chosen_files(arguments):
+    named = [file_of(kind, name) for kind in KINDS
+             if (name := getattr(arguments, kind)) is not None]
+    for path in (*named, *arguments.params):
         values |= read_scene(path, node, to_ros=to_ros)
     values |= {name: value for name, value in map(parse_assignment, arguments.param)
                if is_of_ros(name) == to_ros}
@@ -122,13 +124,6 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
             if frame and not frame.startswith('/'):
                 values[name] = f'{namespace}/{frame}'
     return values
-
-
-def chosen_files(arguments: argparse.Namespace) -> list[Path]:
-    """Return the files of --scene, --imu and --params.  Raises ValueError for no known name."""
-    return [*(file_of(kind, name) for kind in ('scene', 'imu')
-              if (name := getattr(arguments, kind, None)) is not None),
-            *map(Path, arguments.params)]
 
 
 def file_of(kind: str, name: str) -> Path:
@@ -203,8 +198,11 @@ def _fits(section: str, node: str) -> bool:
 def parse_section(section: Mapping[object, object], source: str, *, to_ros: bool = False,
                   ) -> dict[str, object]:
     """Return the parameters in a mapping, each checked.  Raises ValueError, as `read_scene`."""
-    return {name: _checked(name, value, source) for name, value in _flatten(section)
-            if is_of_ros(name) == to_ros}
+    try:
+        return {name: _checked(name, value) for name, value in _flatten(section)
+                if is_of_ros(name) == to_ros}
+    except ValueError as error:
+        raise ValueError(f'{source}: {error}') from None
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -212,22 +210,19 @@ def parse_assignment(text: str) -> tuple[str, object]:
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    return name, _checked(name, parse_yaml(yaml_text, text), text)
+    return name, _checked(name, parse_yaml(yaml_text, text))
 
 
-def _checked(name: str, value: object, source: str) -> object:
-    """Return the value of a parameter of a source, checked unless rclpy declares it."""
-    try:
-        if value is None or (isinstance(value, list) and len(set(map(type, value))) > 1):
-            raise ValueError(f'{name} = {shown(value)}: must be a value, or a list of values of '
-                             'one type, such as [0.0, 1.5]')
-        if is_of_ros(name):
-            return value
-        if name not in parameters.BY_NAME:
-            raise ValueError(f'there is no parameter {name}{likely_name(name)}')
-        return parameters.BY_NAME[name].check(value)
-    except ValueError as error:
-        raise ValueError(f'{source}: {error}') from None
+def _checked(name: str, value: object) -> object:
+    """Return the value of a parameter, checked unless rclpy declares it.  Raises ValueError."""
+    if value is None or (isinstance(value, list) and len(set(map(type, value))) > 1):
+        raise ValueError(f'{name} = {shown(value)}: must be a value, or a list of values of one '
+                         'type, such as [0.0, 1.5]')
+    if is_of_ros(name):
+        return value
+    if name not in parameters.BY_NAME:
+        raise ValueError(f'there is no parameter {name}{likely_name(name)}')
+    return parameters.BY_NAME[name].check(value)
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:

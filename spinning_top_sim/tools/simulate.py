@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from spinning_top_sim.recording.provenance import environment, run_metadata
 from spinning_top_sim.recording.recorder import single
@@ -46,7 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='simulated time [s]; default: the parameter duration')
     add('-o', '--output', metavar='FILE', required=True, type=Path,
         help='file to write, .mcap, .csv or .parquet; an existing one is never overwritten')
-    add('--seed', type=int, help='seed of the noise; default: the parameter seed')
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
@@ -64,7 +62,12 @@ def _run(arguments: argparse.Namespace) -> int:
     epoch_ns = arguments.epoch * NANOSECONDS
     if not 0.0 <= epoch_ns <= LAST_STAMP_NS:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
-    values = _parameters(arguments)
+    given = scene_file.given(arguments, resolve_topic('spinning_top', arguments.namespace))
+    if arguments.duration is not None:
+        given['duration'] = arguments.duration
+    values = parameters.checked(given)
+    if not values['duration'] > 0.0:
+        raise ValueError('--duration S, or the parameter duration, must be given')
     simulation = Simulation(values, round(epoch_ns))
     if objection := simulation.trajectory.top.objection:
         cli.print_line(f'spinning-top simulate: warning: {objection}', sys.stderr)
@@ -94,17 +97,6 @@ def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Se
     write(path, (row.decode(rows)[0] for done in _play(simulation, [table], stops, show)
                  if isinstance(done, Block) for _, _, rows in done.messages), units)
     return units
-
-
-def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the checked parameters of the command line.  Raises ValueError or OSError."""
-    given = scene_file.given(arguments, resolve_topic('spinning_top', arguments.namespace))
-    given.update((name, value) for name, value in vars(arguments).items()
-                 if name in ('seed', 'duration') and value is not None)
-    values = parameters.checked(given)
-    if not values['duration'] > 0.0:
-        raise ValueError('--duration S, or the parameter duration, must be given')
-    return values
 
 
 def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
