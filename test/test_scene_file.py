@@ -18,7 +18,8 @@ VALUES = ['1e-9', '1e5', '-1E+5', '1.5', '.5', '5.', '+5', '-3', '010', '08', '0
           '1:30', '~', 'null', 't', 'y', 'No', 'on', 'True', 'tRUE', '.inf', 'nan', '.NaN',
           '-.nan', '2020-01-01', '0b11', '1e', 'e5', '""', '"1"', "'true'", '!!str 5', 'a b',
           '[1, 2, 3]', '[1.0, 2e3]', '[a, b]', '["1", a]', '[true, false]']
-REFUSED = ['[1, 2.0]', '[1e3, 2]', '[0.5, a]', '[true, "n"]', '', '[1', '{', '&a [*a]', '*b']
+REFUSED = ['[1, 2.0, 3.0]', '[1e3, 2, 0]', '[0.5, a, 1.0]', '[true, "n"]', '', '[1', '{',
+           '&a [*a]', '*b']
 
 
 @contextlib.contextmanager
@@ -71,7 +72,8 @@ def test_a_number_in_quotes_is_a_number_where_a_double_is_wanted(tmp_path):
 
 @pytest.mark.parametrize('text', REFUSED)
 def test_what_rcl_refuses_is_refused(tmp_path, capfd, text):
-    path = scene(tmp_path / 'p.yaml', **{'spin.l3': text})
+    name = 'imu.lever_arm' if text.startswith('[') else 'spin.lz'       # which may be unset
+    path = scene(tmp_path / 'p.yaml', **{name: text})
     with pytest.raises(Exception, match=r'p\.yaml'), ros_node(path):
         pass
     with pytest.raises(ValueError, match=r'p\.yaml'):
