@@ -23,7 +23,7 @@ parquet = pytest.importorskip('pyarrow.parquet')
 RUNS, DURATION = 12, 1.0
 SPEC = {
     'runs': RUNS, 'seed': 5, 'duration': DURATION,
-    'params': ['config/wavy.yaml', {'imu.lever_arm': [0.1, 0.0, 0.0],
+    'params': ['scenes/wavy.yaml', {'imu.lever_arm': [0.1, 0.0, 0.0],
                                                 'imu.drop_rate': 0.2, 'imu.duplicate_rate': 0.2}],
     'sample': {'spin.l3': {'normal': [1.6, 0.1]}, 'initial.theta': {'uniform': [0.2, 1.2]},
                'imu.rate': {'values': [100.0, 200.0]},
@@ -35,7 +35,7 @@ SPEC = {
 def written(folder, **changes):
     """Return a specification in a folder that has our scenes."""
     path = folder / 'spec.yaml'
-    (folder / 'config').symlink_to(ROOT / 'config')
+    (folder / 'scenes').symlink_to(ROOT / 'config')
     path.write_text(yaml.safe_dump({**SPEC, **changes}, sort_keys=False))
     return path
 
