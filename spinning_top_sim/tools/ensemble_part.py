@@ -71,7 +71,9 @@ def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
             times[channel.topic].append(times_ns)
             sent[channel.topic].append(np.hstack(channel.template.decode(rows)).T)
     known_ns = {topic: np.concatenate(parts) for topic, parts in times.items()}
-    rows_ns = np.unique(np.concatenate([*known_ns.values()]))
+    # Faster than np.unique, for they are sorted in parts.
+    every_ns = np.sort(np.concatenate([*known_ns.values()]), kind='stable')
+    rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
 
     def repeated(value: Any) -> 'pyarrow.Array':
         # An unset value (spin.lz) is a null of the type that the other runs have.
