@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='simulated time [s]; default: the parameter duration')
     add('-o', '--output', metavar='FILE', required=True, type=Path,
         help='file to write, .mcap, .csv or .parquet; an existing one is never overwritten')
+    add('--seed', type=int, help='seed of the noise; default: the parameter seed')
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
@@ -63,8 +64,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if not 0.0 <= epoch_ns <= LAST_STAMP_NS:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
     given = scene_file.given(arguments, resolve_topic('spinning_top', arguments.namespace))
-    if arguments.duration is not None:
-        given['duration'] = arguments.duration
+    given |= {name: value for name in ('seed', 'duration')
+              if (value := getattr(arguments, name)) is not None}
     values = parameters.checked(given)
     if not values['duration'] > 0.0:
         raise ValueError('--duration S, or the parameter duration, must be given')
