@@ -53,8 +53,12 @@ def test_mcap_and_rosbags_read_every_message(tmp_path, compression):
     indexes = [record for record in records_of(path.read_bytes())
                if record[0] == Opcode.MESSAGE_INDEX]
     with path.open('rb') as file:
-        assert sum(end - start for _, start, end in indexes) == sum(
-            one.message_index_length for one in make_reader(file).get_summary().chunk_indexes)
+        summary = make_reader(file).get_summary()
+    assert sum(end - start for _, start, end in indexes) == sum(
+        one.message_index_length for one in summary.chunk_indexes)
+    assert len(summary.chunk_indexes) > 1 and (
+        summary.statistics.message_start_time, summary.statistics.message_end_time) == (
+            messages[0][1], messages[-1][1])
     with AnyReader([path]) as reader:           # by the message indexes
         read = list(reader.messages())
         assert [(connection.topic, stamp, bytes(data)) for connection, stamp, data in read
