@@ -251,8 +251,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.torn = opcode != Opcode.DATA_END or not self._ends_at(end)
 
     def _note(self, raw: bytes, offset: int, end: int) -> None:
-        """Note what is in a record or chunk; UNREADABLE."""
-        opcode, times_ns, channels = 0, [], set()
+        """Note what is in a record or chunk.  Raises UNREADABLE."""
+        times_ns, channels = [], set()
         for opcode, content in _records(raw, self._max_bytes):
             if opcode == Opcode.MESSAGE:
                 channel, _, log_time, _ = MESSAGE.unpack_from(content)
@@ -273,7 +273,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if channels:
             self._places.append(
                 Place(min(times_ns), offset, end, max(times_ns), frozenset(channels)))
-        elif opcode in ATTACHED:
+        elif raw[0] in ATTACHED:
             self._attached.append(Place(0, offset, end, 0, frozenset()))
 
     def _ends_at(self, offset: int) -> bool:
@@ -334,12 +334,12 @@ def recover(reader: LogReader, output: Path) -> int:
 
 
 def _parsed(kind: Any, content: bytes) -> Any:
-    """Return a record of mcap; UNREADABLE."""
+    """Return a record of mcap.  Raises UNREADABLE."""
     return kind.read(ReadDataStream(BytesIO(content)))
 
 
 def _records(raw: bytes, max_bytes: int) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and content of a record, or of each in it if it is a chunk; UNREADABLE."""
+    """Yield opcode and content of a record, or of each in a chunk.  Raises UNREADABLE."""
     # Objects of mcap for all messages would take twice the time of `inspect`.
     plain = raw
     if raw[0] == Opcode.CHUNK:
@@ -355,7 +355,7 @@ def _records(raw: bytes, max_bytes: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: Chunk, max_bytes: int) -> bytes:
-    """Return the records in a chunk, which mcap would unpack to any size; UNREADABLE."""
+    """Return the records in a chunk, which mcap would unpack to any size.  Raises UNREADABLE."""
     stream: BinaryIO = BytesIO(chunk.data)
     if chunk.compression == 'zstd':
         stream = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True)

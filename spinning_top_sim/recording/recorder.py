@@ -27,7 +27,7 @@ from spinning_top_sim.recording.provenance import environment
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
 if TYPE_CHECKING:       # the recorder's thread imports it, which takes 0.1 s
-    from spinning_top_sim.recording.writer import McapWriter, Rows
+    from spinning_top_sim.recording.writer import LogRows, McapWriter
 
 QUEUE_BYTES = 32_000_000    # of a full queue; a burst that began with room may go on
 ENTRY_BYTES = 300           # what queued rows cost besides their data, about
@@ -61,7 +61,7 @@ class Recorder:
         self._threads, self._clock = threads, clock
         self._file: McapWriter | None = None
         # Appending to a deque and taking from its other end need no lock between threads.
-        self._queue: deque[tuple[Sequence[Rows], int]] = deque()     # rows, and their bytes
+        self._queue: deque[tuple[Sequence[LogRows], int]] = deque()     # rows, and their bytes
         self._bytes_in = self._bytes_out = self._offered = 0    # of the queue; messages, ever
         self._accepting = True
         # (time, bytes): what had left the queue by that time is on the disk.
@@ -106,7 +106,7 @@ class Recorder:
         """Number of messages that wait for the file, or are lost if the recording has stopped."""
         return self._offered - self.written[0]
 
-    def write(self, rows: Sequence[Rows]) -> None:
+    def write(self, rows: Sequence[LogRows]) -> None:
         """Hand over messages, whose arrays must not change; one thread at a time, no waits."""
         self._offered += sum(len(times_ns) for _, times_ns, _ in rows)
         if self._accepting:
@@ -223,6 +223,6 @@ class Recorder:
             self._on_disk = written
 
 
-def single(topic_index: int, log_time_ns: int, data: bytes) -> Rows:
+def single(topic_index: int, log_time_ns: int, data: bytes) -> LogRows:
     """Return one message as rows."""
     return topic_index, np.array([log_time_ns]), np.frombuffer(data, np.uint8)[np.newaxis]

@@ -43,7 +43,7 @@ MESSAGE_BYTES = np.dtype(MESSAGE).itemsize
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 
 # The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
-Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
+LogRows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
 
 
 class McapWriter:
@@ -56,6 +56,7 @@ class McapWriter:
     topics : the channel of a topic is its index + 1
     metadata : the `spinning_top_sim` record
     compression : of the chunks, 'zstd', 'lz4' or 'none'
+    size : of the file [bytes]
 
     Raises LogError naming the path, ValueError for a topic that is listed twice.
     """
@@ -65,11 +66,11 @@ class McapWriter:
                  min_free_bytes: int = 0) -> None:
         self._path, self._topics = path, topics
         self._compression = '' if compression == 'none' else compression
-        self._rows: list[Rows] = []                 # of the next chunk,
+        self._rows: list[LogRows] = []                 # of the next chunk,
         self._chunk_bytes = 0                       # and its size
         self.message_counts = Counter(dict.fromkeys(range(1, len(topics) + 1), 0))   # by channel
-        self._span: tuple[int, ...] = ()            # earliest and latest stamp of all chunks
-        self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
+        self._span: tuple[int, ...] = ()            # earliest and latest log time of all chunks
+        self.size, self._crc = 0, 0     # of the file; one assignment, so always consistent
         # Records of the summary.  Serialized: thousands of objects would take memory.
         self._summary = [*map(record_bytes, _declarations(topics))]
         header = record_bytes(records.Header(profile='ros2', library=OUR_LIBRARY + version()))
@@ -77,7 +78,7 @@ class McapWriter:
             self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
             try:
                 self.check_disk(min_free_bytes)
-                self._end = self._write([MCAP0_MAGIC, header, *self._summary])
+                self.size, self._crc = self._write([MCAP0_MAGIC, header, *self._summary])
                 # In the head, so that a truncated file tells it in any case.
                 self._write_metadata(METADATA_NAME, metadata)
                 self.sync()
@@ -89,13 +90,9 @@ class McapWriter:
         except (OSError, ValueError) as error:
             raise LogError(f'cannot write {path}: {reason_of(error)}') from error
 
-    @property
-    def size(self) -> int:
-        return self._end[0]
-
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
-        """Add `Rows`, n >= 1, with times in any order.  The arrays must not change afterwards."""
+        """Add `LogRows`, n >= 1, times in any order.  The arrays must not change afterwards."""
         self._rows.append((topic_index, log_times_ns, rows))
         self._chunk_bytes += len(rows) * (MESSAGE_BYTES + rows.shape[1])
 
@@ -155,9 +152,9 @@ class McapWriter:
             compressed_size=len(data), uncompressed_size=len(plain), **span))
         times = [*self._span, *span.values()]
         whole_span = min(times), max(times)
-        written = self._write(blocks)
+        size, crc = self._write(blocks)
         # A KeyboardInterrupt comes behind a call, and none is between these assignments.
-        self._end, self.message_counts, self._span = written, counts, whole_span
+        self.size, self._crc, self.message_counts, self._span = size, crc, counts, whole_span
         self._rows, self._chunk_bytes = [], 0
         self._summary += [summary]
 
@@ -182,7 +179,7 @@ class McapWriter:
             start_ns, end_ns = self._span or (0, 0)
             self._write_metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
                 self._topics, [*self.message_counts.values()], self._path.name, start_ns, end_ns))
-            self._end = self._write([record_bytes(records.DataEnd(self._end[1]))])
+            self.size, self._crc = self._write([record_bytes(records.DataEnd(self._crc))])
             kinds = Counter(raw[0] for raw in self._summary)
             statistics = record_bytes(records.Statistics(
                 attachment_count=0, channel_count=len(self._topics),
@@ -193,7 +190,7 @@ class McapWriter:
             # The summary's checksum runs on into the footer, up to the checksum itself.
             summary = b''.join([*sorted([*self._summary, statistics], key=itemgetter(0)),
                                 record_bytes(records.Footer(self.size, 0, 0))[:-4]])
-            self._end = self._write(
+            self.size, self._crc = self._write(
                 [summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
             self.sync()
         except OSError as error:
@@ -206,12 +203,12 @@ class McapWriter:
     def _write_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
         raw = record_bytes(records.Metadata(name, dict(metadata)))
         index = record_bytes(records.MetadataIndex(self.size, len(raw), name))
-        self._end = self._write([raw])
+        self.size, self._crc = self._write([raw])
         self._summary.append(index)
 
     def _write(self, blocks: Iterable[bytes]) -> tuple[int, int]:
         """Write whole records that come in blocks, or none of them; return size and checksum."""
-        offset, crc = self._end
+        offset, crc = self.size, self._crc
         descriptor = self._file.fileno()
         try:
             for block in blocks:
