@@ -59,7 +59,7 @@ ACTS = {
     'slow': lambda one: one.apply('parameters', **{'imu.rate': 40.0}),
     'epoch': lambda one: one.apply('epoch', epoch_ns=one.epoch_ns + 12_345),
     'reset': lambda one: one.apply('reset', epoch_ns=EPOCH_NS + 10 ** 10,
-                                   parameters={**one.values, 'initial.theta': 0.7})}
+                                   parameters={**one.values_at_start, 'initial.theta': 0.7})}
 # Times between them: none, on samples, next to samples, anywhere.
 PAUSES = st.sampled_from((0, 1, 2 * MILLISECOND, 12 * MILLISECOND)) | st.integers(
     0, 40).map(lambda k: 2 * MILLISECOND * k - 1).filter(lambda t: t > 0) | st.integers(
@@ -71,8 +71,8 @@ def go(simulation, events, advance):
     """Run through the events; `advance` goes on to a time [ns] and returns what it yields."""
     taken = []
     for pause_ns, name in (*events, (30 * MILLISECOND, '')):
-        until_ns = max(simulation.now_ns, 0) + pause_ns
-        if until_ns > simulation.now_ns:
+        until_ns = simulation.now_ns + pause_ns
+        if until_ns > simulation.sent_ns:
             taken += advance(simulation, until_ns) or ()
         if name:
             try:
@@ -91,17 +91,17 @@ def by_topic(taken):
 
 def at_once(simulation, until_ns):
     """Nothing is forgotten, either."""
-    assert simulation.reach(simulation.now_ns, until_ns) == until_ns
-    messages = simulation.messages(simulation.channels, simulation.now_ns, until_ns)
-    simulation.now_ns = until_ns
+    assert simulation.reach(simulation.sent_ns, until_ns) == until_ns
+    messages = simulation.messages(simulation.channels, simulation.sent_ns, until_ns)
+    simulation.sent_ns = until_ns
     return entries(simulation, messages)
 
 
 def in_pieces(dice):
     def advance(simulation, until_ns):
         taken = []
-        while simulation.now_ns < until_ns:
-            taken += play(simulation, min(until_ns, simulation.now_ns + dice.choice(
+        while simulation.sent_ns < until_ns:
+            taken += play(simulation, min(until_ns, simulation.sent_ns + dice.choice(
                 (1, MILLISECOND, dice.randrange(1, 10 * MILLISECOND)))
                 if dice.random() < 0.1 else until_ns))
         return taken
@@ -111,9 +111,9 @@ def in_pieces(dice):
 def live(dice, published):
     """Calls give way, look ahead for any time; subscribers come and go."""
     def advance(simulation, until_ns):
-        while not simulation.send(dice.choice((until_ns, (until_ns + simulation.now_ns) // 2)),
+        while not simulation.send(dice.choice((until_ns, (until_ns + simulation.sent_ns) // 2)),
                                   give_way=lambda: dice.random() < 0.3
-                                  ) or simulation.now_ns < until_ns:
+                                  ) or simulation.sent_ns < until_ns:
             simulation.look_ahead(until_ns + dice.choice((0, 1, 16, 200)) * MILLISECOND,
                                   dice.choice((0.0, 1e-4, 1e-2)))
             for output in simulation.outputs:

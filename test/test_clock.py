@@ -16,8 +16,8 @@ class Top:
         self.warnings = []
         self.steady_ns = self.date_ns = self.sent_ns = self.epoch_ns = 0
         self.clock = SimulatedClock(
-            lambda: self.date_ns, self.warnings.append, publishers and (lambda: self.publishers),
-            lambda: self.steady_ns)
+            lambda: self.date_ns, self.warnings.append, follows=publishers is not None,
+            publishers=lambda: self.publishers, steady=lambda: self.steady_ns)
         self.clock.set_scale(scale)
         self.publishers = publishers
 

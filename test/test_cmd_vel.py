@@ -20,7 +20,7 @@ ODOMETRY, IMU = 'ground_truth/odom', 'ground_truth/imu'
 def goes_to(simulation, t_ns):
     """Let the motion go on; return position and velocity of the pivot (3,) there."""
     list(simulation.play((), t_ns))
-    place = simulation.trajectory.place(np.array([t_ns]))
+    place = simulation.trajectory.pivot_at(np.array([t_ns]))
     return place.position[:, 0], place.velocity[:, 0]
 
 
@@ -52,7 +52,7 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     drive(simulation, 0.0, 0.8, 0.0)
     before = goes_to(simulation, 11 * S + S // 5)
     drive(simulation, 0.0, 0.8, 0.0)
-    after = goes_to(simulation, simulation.now_ns)
+    after = goes_to(simulation, simulation.sent_ns)
     assert 0.0 < before[1][1] < 0.8 and len(simulation.history) == 3
     assert np.array_equal(before, after)
     assert goes_to(simulation, 11 * S + S // 2)[1][1] == 0.8
@@ -71,7 +71,7 @@ def test_spin_counts_about_the_vertical_of_the_world():
     before = simulation.state()
     present = momenta(before)
     assert simulation.trajectory.momenta(3 * S // 2) == pytest.approx(present, rel=1e-13)
-    assert abs(present[1] - parameters.start_state(simulation.values).lz) > 0.01
+    assert abs(present[1] - parameters.start_state(simulation.values_at_start).lz) > 0.01
     simulation.apply('command', l3=1.2, lz=0.9)
     after = simulation.state()
     assert abs(before.quaternion - after.quaternion).max() < 4e-15
@@ -91,7 +91,7 @@ def test_a_scene_with_a_moving_pivot_feels_its_acceleration(scene, expected):
     for topic in ('pose', '/tf'):
         assert np.array_equal(found[topic][2], position)
         assert np.array_equal(found[topic][3], q)
-    speed = simulation.trajectory.place(np.array([9 * S])).velocity[:, 0]
+    speed = simulation.trajectory.pivot_at(np.array([9 * S])).velocity[:, 0]
     assert np.ravel(attitude.rotated(q[-1], velocity[-1])) == pytest.approx(speed, abs=1e-14)
     sizes = np.linalg.norm(found[IMU][-1], axis=1)
     assert (sizes.min(), sizes.max()) == pytest.approx(expected, rel=1e-15, abs=1e-30)

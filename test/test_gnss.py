@@ -36,7 +36,7 @@ def test_the_truth_is_the_path_of_the_pivot_on_the_ellipsoid(noisy):
     assert np.array_equal(stamps_ns - simulation.epoch_ns, t_ns)
     assert np.array_equal(t_ns, np.arange(4001) * PERIOD_NS)
     simulation, _ = run(SHUTTLE, -1)
-    place = simulation.trajectory.place(t_ns)
+    place = simulation.trajectory.pivot_at(t_ns)
     assert enu(fixes) == pytest.approx(place.position.T, abs=1e-7)
     assert np.array_equal(found[TRUE_VELOCITY][2], place.velocity.T)
     assert np.linalg.norm(place.velocity, axis=0).max() == pytest.approx(3.0, rel=1e-6)

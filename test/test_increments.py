@@ -37,7 +37,7 @@ def test_increments_and_means_are_those_of_thirty_digits(case):
         **scene_parameters(case['scene']), 'solver.method': 'exact', 'imu.sampling': 'mean',
         'imu.lever_arm': case['lever_arm'], 'imu.rpy': case['rpy'],
         'imu.rate': SECOND / case['length_ns']})
-    simulation.now_ns = case['begin_ns']
+    simulation.sent_ns = case['begin_ns']
     taken = play(simulation, case['begin_ns'] + case['length_ns'], DQ, DV, 'imu/data_raw')
     *_, (dq,) = fields(simulation, taken, DQ)
     *_, (dv,) = fields(simulation, taken, DV)

@@ -27,13 +27,13 @@ class Run:
         self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
         self.counted = 0            # how often subscribers were
         self.simulation = simulate(**values)
-        self.values, self._taken = self.simulation.values, []
+        self.values, self._taken = self.simulation.values_at_start, []
         recording = SimpleNamespace(has_room=lambda *_: self.room, is_on=True,
                                     write=self.told.append)
         self.loop = Loop(
             self.simulation, self.values, recording, SimulatedClock(
-                lambda: DATE_NS + self.now_ns - 77, self.told.append,
-                (lambda: 1) if follows else None, self.read),
+                lambda: DATE_NS + self.now_ns - 77, self.told.append, follows=follows,
+                steady=self.read),
             update_subscribers=self.count, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
@@ -82,8 +82,8 @@ def test_ticks_send_all_that_is_due_however_late_they_come_and_late_ones_are_cou
     run.tick(10_100_000)
     run.tick(50 * TICK_NS)
     assert (loop.late_ticks, loop.skipped_ticks) == (2, 1 + 49)
-    assert loop.now_ns == 20 * TICK_NS + 7_400_000 + 10_100_000 + 50 * TICK_NS
-    assert run.times == grid(loop.now_ns)
+    assert run.simulation.now_ns == 20 * TICK_NS + 7_400_000 + 10_100_000 + 50 * TICK_NS
+    assert run.times == grid(run.simulation.now_ns)
 
 
 def test_a_pause_holds_a_step_is_exact_and_nothing_is_caught_up(monkeypatch):
@@ -93,25 +93,26 @@ def test_a_pause_holds_a_step_is_exact_and_nothing_is_caught_up(monkeypatch):
         run.loop.step(SECOND)
     run.now_ns += 3_000_001
     run.loop.pause()
-    assert run.loop.now_ns == 50 * (7 * TICK_NS + 3_000_001)
+    assert run.simulation.now_ns == 50 * (7 * TICK_NS + 3_000_001)
     run.step_ns = 1_333                             # any code takes time
     for length_ns in (210_000_000, 333_333_333, 1):
         run.tick(SECOND)
-        before = run.loop.now_ns
+        before = run.simulation.now_ns
         run.loop.step(length_ns)
-        assert run.loop.now_ns - before == length_ns
+        assert run.simulation.now_ns - before == length_ns
     assert run.loop.state is LoopState.PAUSED
     monkeypatch.setattr(module, 'STEP_BUDGET_NS', 150_000)
-    run.step_ns, before = 100_000, run.loop.now_ns
+    run.step_ns, before = 100_000, run.simulation.now_ns
     with pytest.raises(RuntimeError, match=r'takes too long, \d+\.\d+ s are left') as error:
         run.loop.step(1000 * SECOND)
-    left = float(str(error.value).split()[-4])
-    assert 0.0 < left == pytest.approx(1000.0 - (run.loop.now_ns - before) / SECOND, abs=1e-6)
-    run.step_ns, before = 0, run.loop.now_ns
+    left, done_ns = float(str(error.value).split()[-4]), run.simulation.now_ns - before
+    assert 0.0 < left == pytest.approx(1000.0 - done_ns / SECOND, abs=1e-6)
+    run.step_ns, before = 0, run.simulation.now_ns
     run.loop.resume()
     run.loop.resume()
     run.ticks(3)
-    assert run.loop.now_ns == before + 50 * 3 * TICK_NS and run.times == grid(run.loop.now_ns)
+    assert run.simulation.now_ns == before + 50 * 3 * TICK_NS
+    assert run.times == grid(run.simulation.now_ns)
     assert run.loop.late_ticks == run.loop.skipped_ticks == 0
 
 
@@ -120,7 +121,7 @@ def test_a_change_of_parameters_does_not_hide_a_jump_of_the_clock():
     run.now_ns += 3600 * SECOND
     run.loop.set_parameters(run.values, {'status_period': 0.5})
     run.ticks(2)
-    assert run.kinds == ['epoch', 'parameters'] and run.loop.now_ns == 6 * TICK_NS
+    assert run.kinds == ['epoch', 'parameters'] and run.simulation.now_ns == 6 * TICK_NS
 
 
 def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahead_slips(
@@ -131,18 +132,18 @@ def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahe
     run = Run(time_scale=scale, pose__rate=1000.0).ticks(4)
     run.step_ns = 100_000
     run.tick(900_000_000)
-    assert run.loop.now_ns < scale * 900_000_000
+    assert run.simulation.now_ns < scale * 900_000_000
     run.step_ns = 0
     run.ticks(10)
-    assert run.loop.now_ns > scale * 900_000_000 and run.loop.slipped_ns == 0
-    run.room, stands_at = False, run.loop.now_ns
+    assert run.simulation.now_ns > scale * 900_000_000 and run.loop.slipped_ns == 0
+    run.room, stands_at = False, run.simulation.now_ns
     run.tick(900_000_000)
     run.tick(200_000_000)
-    assert (run.loop.now_ns, run.loop.slipped_ns) == (stands_at, scale * 1_100_000_000)
+    assert (run.simulation.now_ns, run.loop.slipped_ns) == (stands_at, scale * 1_100_000_000)
     run.room = True
     run.ticks(4)
-    assert run.loop.now_ns == stands_at + scale * 4 * TICK_NS
-    assert run.times == grid(run.loop.now_ns, SECOND // 1000)
+    assert run.simulation.now_ns == stands_at + scale * 4 * TICK_NS
+    assert run.times == grid(run.simulation.now_ns, SECOND // 1000)
 
 
 def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():
@@ -151,13 +152,13 @@ def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():
     run.loop.reset(run.values)
     assert run.simulation.epoch_ns == DATE_NS + 40_000_000      # behind the sample at 30 ms
     run.ticks(2)
-    assert run.loop.now_ns == 0, 'its date comes first'
+    assert run.simulation.now_ns == 0, 'its date comes first'
     run.ticks(2)
-    assert run.loop.now_ns == 2 * TICK_NS and run.times == grid(2 * TICK_NS)
+    assert run.simulation.now_ns == 2 * TICK_NS and run.times == grid(2 * TICK_NS)
     run.loop.pause()
     run.loop.reset(run.values)
     run.ticks(30)
-    assert (run.loop.now_ns, run.times, run.kinds) == (0, [], ['reset', 'reset'])
+    assert (run.simulation.now_ns, run.times, run.kinds) == (0, [], ['reset', 'reset'])
     run.command(2.0)
     assert run.counted > 0 and run.times == [0], 'a change sends the first sample to those there'
     run.loop.reset(run.values, paused=False)
@@ -177,13 +178,13 @@ FAILING = {
 def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
     run = Run(**FAILING[reason])
     run.ticks(400)
-    stands_at = run.loop.now_ns
+    stands_at = run.simulation.now_ns
     assert reason in run.loop.failure and run.loop.state is LoopState.FAILED
     assert run.times == grid(stands_at)
     assert sum('until ~/reset' in told for told in run.told) == 1
     for act in (lambda: run.command(1.0), lambda: run.loop.step(POSE_NS), run.loop.resume):
         with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
             act()
-    assert run.ticks(5).loop.now_ns == stands_at
-    run.loop.reset(simulate().values)
-    assert run.loop.failure is None and run.ticks(404).loop.now_ns > stands_at
+    assert run.ticks(5).run.simulation.now_ns == stands_at
+    run.loop.reset(simulate().values_at_start)
+    assert run.loop.failure is None and run.ticks(404).run.simulation.now_ns > stands_at

@@ -29,8 +29,8 @@ def test_the_body_is_where_the_pose_is_and_the_trace_is_the_path_of_the_tip(valu
     times_ns, _, position, body, pivot, axis, *trace = found['markers']
     attitudes = found['pose'][3][::5]
     assert np.array_equal(body, attitudes) and np.array_equal(body, axis) and not pivot.any()
-    top, start = simulation.trajectory.top, parameters.start_state(simulation.values)
-    shape, length = Shape(top), simulation.values['markers.trace_length']
+    top, start = simulation.trajectory.top, parameters.start_state(simulation.values_at_start)
+    shape, length = Shape(top), simulation.values_at_start['markers.trace_length']
     assert position == pytest.approx(shape.centre * axis_of(body), abs=1e-15)
     assert bool(trace) == (count > 0)
     for points, q, t_ns in zip(*trace, body, times_ns, strict=True) if trace else ():

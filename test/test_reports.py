@@ -22,7 +22,7 @@ def test_the_worst_problem_is_told_and_the_real_time_factor_is_that_since_the_la
     monkeypatch.setattr(status, 'time', SimpleNamespace(monotonic=lambda: clock.now))
     simulation = simulate(start_paused=True)
     recording = Recording(simulation, lambda channels: [])
-    loop = Loop(simulation, simulation.values, recording, SimulatedClock(
+    loop = Loop(simulation, simulation.values_at_start, recording, SimulatedClock(
         lambda: EPOCH_NS, print, steady=lambda: 0), update_subscribers=print, error=print)
     report = status.NodeStatus(simulation, loop, recording)
     loop.start()
@@ -40,7 +40,7 @@ def test_the_worst_problem_is_told_and_the_real_time_factor_is_that_since_the_la
     assert factor(0.01) == 2.5, 'a report that was held up'
     loop.step(SECOND // 2)
     assert factor(0.99) == 0.5
-    loop.reset(simulation.values)
+    loop.reset(simulation.values_at_start)
     loop.step(SECOND // 4)
     assert factor(1.0) == 0.25
 

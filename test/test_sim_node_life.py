@@ -30,7 +30,7 @@ def test_readers_that_stall_are_counted_and_motion_and_recording_go_on(tmp_path)
         _, _, said = node.diagnostics()
         assert (said['state'], said['recorder']) == ('running', 'recording')
         reader.destroy_subscription(taken)
-        t_ns = node.simulation.now_ns
+        t_ns = node.simulation.sent_ns
         node.wait_until(t_ns + 100_000_000)
         reader.destroy_node()
     path = tmp_path / 'run.mcap'

@@ -79,7 +79,7 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
     """Each is refused with the value named; the motion is to the bit the undisturbed one."""
     assert node.switch('record', True).success
     node.step(10)
-    before, rejected = (node.node.values, node.loop.commands), node.loop.rejected_commands
+    before, rejected = (node.node.values_next, node.loop.commands), node.loop.rejected_commands
     for data, named in REFUSED_COMMANDS.items():
         node.command(*data)
         assert named in capfd.readouterr().err, data
@@ -100,7 +100,7 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
     assert not node.set(world_frame='map').successful, 'read-only'
     spins = sum(any('spin__' in key for key in given) for given, _ in REFUSED_PARAMETERS)
     assert node.loop.rejected_commands == rejected + spins
-    assert (node.node.values, node.loop.commands) == before
+    assert (node.node.values_next, node.loop.commands) == before
     node.step(10)
     assert {event['event'] for event in events_in(recorded(node))} == {'start', 'parameters'}
 
@@ -108,11 +108,11 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
 def test_a_stream_that_cannot_be_published_is_refused_before_anything_changes(tmp_path):
     with OwnNode(tmp_path, '-p', 'qos_overrides./imu/mag.publisher.reliability:=foo',
                  start_paused=True) as node:
-        before, rates = node.node.values, [one.period_ns for one in node.simulation.channels]
+        before, rates = node.node.values_next, [one.period_ns for one in node.simulation.channels]
         topics = {one.topic_name for one in node.node.publishers}
         result = node.set(imu_data__enabled=True, mag__enabled=True, pose__rate=20.0)
         assert not result.successful and 'foo' in result.reason
-        assert node.node.values == before and not node.get('mag.enabled')[0]
+        assert node.node.values_next == before and not node.get('mag.enabled')[0]
         assert [one.period_ns for one in node.simulation.channels] == rates
         assert {one.topic_name for one in node.node.publishers} == topics
         assert not node.simulation.history

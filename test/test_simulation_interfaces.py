@@ -105,10 +105,10 @@ def test_states_change_as_the_standard_says(top):
                               ('PAUSED', ALREADY, PAUSED), ('STOPPED', OK, STOPPED),
                               ('PLAYING', OK, PLAYING), ('PLAYING', ALREADY, PLAYING)):
         assert (top.set_state(name), top.state) == (code, state)
-        assert top.simulation.now_ns == (0 if state == PAUSED else -1), 'of t = 0 at most'
+        assert top.simulation.sent_ns == (0 if state == PAUSED else -1), 'of t = 0 at most'
     top.wait_until(50_000_000)
     assert (top.set_state('PAUSED'), top.state) == (OK, PAUSED)
-    assert (top.set_state('STOPPED'), top.state, top.simulation.now_ns) == (OK, STOPPED, -1)
+    assert (top.set_state('STOPPED'), top.state, top.simulation.sent_ns) == (OK, STOPPED, -1)
 
 
 def test_what_is_offered_is_told_and_the_rest_refused_with_its_values(top):
@@ -164,7 +164,7 @@ def test_a_reset_begins_the_motion_again_or_lets_time_go_on(top, scope, now_ns, 
     top.pause(steps=3)
     assert top.set(spin__l3=2.5).successful
     top.done('ResetSimulation', scope=scope)
-    assert (top.simulation.now_ns, top.state, top.get('spin.l3')) == (now_ns, state, [1.6])
+    assert (top.simulation.sent_ns, top.state, top.get('spin.l3')) == (now_ns, state, [1.6])
     assert (numbers(top.entity) == start).all()
 
 

@@ -37,7 +37,7 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path):
     assert len(poses) == len(positions) == 101
     assert model.actuated_joint_names == list(JOINTS)
     arm = np.array(MOUNTED['imu.lever_arm'])
-    mounting = Mounting(simulation.values)
+    mounting = Mounting(simulation.values_at_start)
     imu = matrix(np.concatenate(mounting.orientation(simulation.state())))
     # Unwrapped angles of thousands of radians cannot be told to 1e-12.
     limit = max(1e-12, 2.0 * np.spacing(np.abs(positions).max()))

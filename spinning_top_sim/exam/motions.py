@@ -171,7 +171,7 @@ def readings(values: Mapping[str, Any], period_ns: int, rates: Reals, force: Rea
     true: Any = tuple(rates.T), tuple(force.T)
     x, y, z, w = turns.as_quat().T
     device, magnetometer = Imu(values, period_ns), Magnetometer(values, period_ns)
-    field = magnetometer.read(magnetometer.felt((x, y, z, w), field_ns),
+    field = magnetometer.read(magnetometer.disturbed((x, y, z, w), field_ns),
                               magnetometer.errors(times))
     return [np.stack(np.broadcast_arrays(*columns), axis=1) for columns in (
         *device.read(true, device.errors(times)), field)]

@@ -21,18 +21,19 @@ class SimulatedClock:
     """
     Simulated time that runs `scale` times as fast as a source.  Times are in ns.
 
-    The source is the steady clock.  With `publishers`, which returns how many nodes publish on
-    /clock, it is the date, which is that /clock, and the steady clock decides only what is late.
+    The source is the steady clock.  One that `follows` the /clock of another node has that as its
+    date and source, and the steady clock decides only what is late.
 
     date, steady : return the date, 0 before the first message on a /clock, and steady time
     warn : takes a text about what /clock has done
+    publishers : returns how many nodes publish on /clock
     """
 
-    def __init__(self, date: Reading, warn: Callable[[str], object],
-                 publishers: Callable[[], int] | None = None,
+    def __init__(self, date: Reading, warn: Callable[[str], object], *, follows: bool = False,
+                 publishers: Callable[[], int] = lambda: 1,
                  steady: Reading = time.monotonic_ns) -> None:
         self.date, self.steady, self._warn, self._publishers = date, steady, warn, publishers
-        self._source = date if publishers else steady
+        self.follows, self._source = follows, date if follows else steady
         self._scale = 1.0
         self._source_ns = self._simulated_ns = 0    # the anchor: two times of one moment
         self._newest_ns = 0                         # of the source
@@ -49,9 +50,9 @@ class SimulatedClock:
         """
         date_ns = self._counting(self.date())
         epoch_ns = date_ns - date_ns % EPOCH_GRID_NS or EPOCH_GRID_NS   # 0 means "no time"
-        if not self._publishers and epoch_ns < date_ns:
+        if not self.follows and epoch_ns < date_ns:
             epoch_ns += EPOCH_GRID_NS
-        if not self._publishers or last_stamp_ns <= date_ns:
+        if not self.follows or last_stamp_ns <= date_ns:
             epoch_ns = max(epoch_ns, last_stamp_ns + EPOCH_GRID_NS - last_stamp_ns % EPOCH_GRID_NS)
         return epoch_ns
 
@@ -74,7 +75,7 @@ class SimulatedClock:
 
     def until_grid(self, period_ns: float) -> float:
         """Return how long it is to the next multiple of a period of real time from t = 0 [ns]."""
-        if self._publishers:
+        if self.follows:
             return period_ns
         return period_ns - (self._source() - self._source_ns + self._simulated_ns / self._scale
                             ) % period_ns
@@ -89,7 +90,7 @@ class SimulatedClock:
 
     def _counting(self, source_ns: int) -> int:
         """Return the time of the source that counts: of several /clock, the latest."""
-        if self._publishers and source_ns < self._newest_ns and self._publishers() != 1:
+        if self.follows and source_ns < self._newest_ns and self._publishers() != 1:
             return self._newest_ns
         return source_ns
 
@@ -101,7 +102,7 @@ class SimulatedClock:
         published.  By the third, the stamp of t = 0, `epoch_ns`, moves to be at /clock again.
         """
         source_ns = self._source()
-        if self._publishers is None:
+        if not self.follows:
             due_ns = self._at(source_ns)
             return due_ns, due_ns - int(LATEST_NS * self._scale), 0
         shift_ns = 0
@@ -136,7 +137,7 @@ class SimulatedClock:
         """
         source_ns = self._source()
         lag_ns = self._at(source_ns) - sent_ns
-        if self._publishers or lag_ns <= LONGEST_LAG_NS * self._scale:
+        if self.follows or lag_ns <= LONGEST_LAG_NS * self._scale:
             return 0
         self._anchor(sent_ns, source_ns)
         return lag_ns

@@ -53,7 +53,7 @@ class Loop:
 
     @property
     def state(self) -> LoopState:
-        if self._simulation.now_ns >= self._duration_ns:
+        if self._simulation.sent_ns >= self._duration_ns:
             return LoopState.ENDED              # which is final
         if self.failure:
             return LoopState.FAILED             # until a reset
@@ -62,14 +62,9 @@ class Loop:
         return LoopState.PAUSED if self.paused else LoopState.RUNNING
 
     @property
-    def now_ns(self) -> int:
-        """Simulated time up to which samples are sent [ns], >= 0."""
-        return max(self._simulation.now_ns, 0)
-
-    @property
     def time_text(self) -> str:
         """The simulated time for the user, with all its digits."""
-        return f'at t = {stamp_text(self.now_ns)} s'
+        return f'at t = {stamp_text(self._simulation.now_ns)} s'
 
     def _set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""
@@ -101,7 +96,7 @@ class Loop:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         target_ns = self._advance()
-        if self._simulation.now_ns >= target_ns:
+        if self._simulation.sent_ns >= target_ns:
             self._simulation.look_ahead(target_ns + self._ahead_ns,
                                         self.tick_period_ns / NANOSECONDS)
 
@@ -109,7 +104,7 @@ class Loop:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
         simulation, clock = self._simulation, self._clock
         if self.state is not LoopState.RUNNING:
-            return simulation.now_ns
+            return simulation.sent_ns
         due_ns, late_ns, shift_ns = clock.due(simulation.epoch_ns)
         if shift_ns:
             self._recording.write(
@@ -119,8 +114,8 @@ class Loop:
         if has_room():
             self._send(target_ns, min(late_ns, target_ns) + 1,
                        lambda: clock.steady() > stop_at_ns or not has_room())
-        if simulation.now_ns < target_ns and not self.failure:
-            self.slipped_ns += clock.slip(self.now_ns)
+        if simulation.sent_ns < target_ns and not self.failure:
+            self.slipped_ns += clock.slip(simulation.now_ns)
         return target_ns
 
     def _send(self, until_ns: int, publish_from_ns: int, give_way: Callable[[], bool]) -> None:
@@ -143,7 +138,7 @@ class Loop:
         self._check_motion()
         if self.paused:
             self.paused = False
-            self._clock.run(self.now_ns)
+            self._clock.run(self._simulation.now_ns)
             self._last_tick_ns = self._clock.steady()   # the next tick is not late
 
     def step(self, length_ns: int) -> None:
@@ -152,16 +147,16 @@ class Loop:
         if not self.paused:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
-        target_ns = min(self.now_ns + length_ns, self._duration_ns)
+        target_ns = min(self._simulation.now_ns + length_ns, self._duration_ns)
         stop_at_ns = self._clock.steady() + STEP_BUDGET_NS
         # Other than a tick it waits for the recorder.
         self._send(target_ns, 0, lambda: self._clock.steady() > stop_at_ns or (
             not self._recording.has_room(STEP_BUDGET_NS / NANOSECONDS)))
         if self.failure:
             raise RuntimeError(self.failure)
-        if self.now_ns < target_ns:
+        if (left_ns := target_ns - self._simulation.now_ns) > 0:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
-                               f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
+                               f'{left_ns / NANOSECONDS:.9g} s are left')
 
     def change(self, kind: str, details: Callable[[], Mapping[str, Any] | None]) -> None:
         """
@@ -171,7 +166,7 @@ class Loop:
 
         Raises ValueError for what cannot be, and RuntimeError in WAITING and FAILED.
         """
-        if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
+        if self._simulation.sent_ns < 0:         # the change sends the samples of t = 0
             self._update_subscribers()
         self._advance()
         self._check_motion()
@@ -201,7 +196,7 @@ class Loop:
         if self.state in (LoopState.WAITING, LoopState.ENDED):
             raise RuntimeError(self.state.value)
         simulation = self._simulation
-        last_stamp_ns = simulation.epoch_ns + simulation.now_ns
+        last_stamp_ns = simulation.epoch_ns + simulation.sent_ns
         event = simulation.apply('reset', parameters=values,
                                  epoch_ns=self._clock.next_epoch(last_stamp_ns))
         self.failure = None
@@ -216,7 +211,7 @@ class Loop:
 
     def end(self) -> None:
         """Let nothing follow what is sent."""
-        self._duration_ns = self._simulation.now_ns
+        self._duration_ns = self._simulation.sent_ns
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""

@@ -42,7 +42,7 @@ class Simulator(Node):
     The node.
 
     given : parameters of its command line, which those of ROS override
-    values : the parameters that a reset starts with; an unset spin.lz follows initial.theta
+    values_next : parameters at the next reset or recording; an unset spin.lz follows initial.theta
 
     Raises ValueError for a parameter that is not allowed.
     """
@@ -52,7 +52,7 @@ class Simulator(Node):
         self.finished: Future = Future()        # completes after `duration`
         log = self._log = self.get_logger()
         overrides = ros_parameters.take_overrides(self)
-        values = self.values = ros_parameters.declare(self, given, overrides)
+        values = self.values_next = ros_parameters.declare(self, given, overrides)
         self.set_descriptor('use_sim_time', ParameterDescriptor(
             read_only=True, dynamic_typing=True))
         simulation = self.simulation = LiveSimulation(values)
@@ -60,13 +60,13 @@ class Simulator(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._topics = publishers.ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
-        # Whether there is a /clock of another node: a node does not follow its own.
-        self._follows = self.get_parameter('use_sim_time').value and not (
+        # A node does not follow its own /clock.
+        follows = self.get_parameter('use_sim_time').value and not (
             parameters.is_enabled('clock', values))
-        topic = self.resolve_topic_name('/clock')
         self.clock = SimulatedClock(
-            (lambda: int(self.get_clock().now().nanoseconds)) if self._follows else time.time_ns,
-            log.warning, partial(self.count_publishers, topic) if self._follows else None)
+            (lambda: int(self.get_clock().now().nanoseconds)) if follows else time.time_ns,
+            log.warning, follows=follows, publishers=partial(
+                self.count_publishers, self.resolve_topic_name('/clock')))
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
             error=log.error, update_subscribers=self._topics.update_subscribers)
@@ -90,8 +90,8 @@ class Simulator(Node):
         sys.setswitchinterval(1e-4)
         self._report = NodeStatus(self.simulation, self.loop, self._recording)
         self._every('diagnostics', 1.0, self._publish_diagnostics)
-        self._every('status', self.values['status_period'],
-                    lambda: tell(self._report.status_line()))
+        if period := self.values_next['status_period']:
+            self._every('status', period, lambda: tell(self._report.status_line()))
         self._begin()
         self._align_ticks()
 
@@ -101,8 +101,8 @@ class Simulator(Node):
             self._log.warning(self.loop.state.value, once=True)
             return
         self.loop.start()
-        if self.values['record.enabled']:
-            self._recording.start(self.values, lambda success, text: (
+        if self.values_next['record.enabled']:
+            self._recording.start(self.values_next, lambda success, text: (
                 self._log.info(text) if success else None))
 
     def _align_ticks(self) -> None:
@@ -113,7 +113,7 @@ class Simulator(Node):
             self._every('tick', period_ns / NANOSECONDS, self._tick)
             self._tick()
 
-        self._every('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
+        self._once('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
 
     def _tick(self) -> None:
         self.loop.tick()
@@ -124,19 +124,22 @@ class Simulator(Node):
             self._begin()
         elif state is LoopState.ENDED and 'end' not in self._alarms:
             publishers.wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self._every('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
+            self._once('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
 
     def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
-        """
-        Call back periodically [s], 0 = never, instead of what this timer did before.
-
-        The timer follows no /clock.
-        """
+        """Call back in steady time, each `period` [s], instead of what this timer did before."""
         if name in self._alarms:
-            self.destroy_timer(self._alarms.pop(name))
-        if period:
-            self._alarms[name] = self.create_timer(
-                period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.destroy_timer(self._alarms[name])
+        self._alarms[name] = self.create_timer(
+            period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _once(self, name: str, delay: float, callback: Callable[[], object]) -> None:
+        """Call back once, after a delay [s], instead of what this timer did before."""
+        def act() -> None:
+            self._alarms[name].cancel()
+            callback()
+
+        self._every(name, delay, act)
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
@@ -148,7 +151,7 @@ class Simulator(Node):
         def command() -> None:
             if len(message.data) != len(SPIN):
                 raise ValueError(f'data has {len(message.data)} values: must be [L3, Lz]')
-            self._command(parameters.checked_changes(dict(zip(SPIN, message.data, strict=True))))
+            self._command(dict(zip(SPIN, message.data, strict=True)))
             self.show_spin()
 
         self._obey('~/commands', command)
@@ -176,37 +179,37 @@ class Simulator(Node):
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if changes.items() <= self._spin().items():     # nothing changes
             return SetParametersResult(successful=True)
-        error, reason = self.outcome(lambda: self._change(changes))
-        if error is not None and ros_parameters.is_command(changes):
+        command, others = ros_parameters.commanded(changes)
+        error, reason = self.outcome(lambda: self._change(command, others))
+        if error is not None and command:
             self.loop.rejected_commands += 1
         return SetParametersResult(successful=error is None, reason=reason)
 
-    def _change(self, changes: Mapping[str, Any]) -> None:
-        for name, value in changes.items():
+    def _change(self, command: Mapping[str, Any], others: Mapping[str, Any]) -> None:
+        """Command a spin and take over other parameters, or none of them where one is refused."""
+        for name, value in (*command.items(), *others.items()):
             if value is None:
                 raise ValueError(f'{name}: cannot be unset while the node runs')
-        spin = {name: changes[name] for name in SPIN if name in changes}
-        command = parameters.checked_changes(spin if ros_parameters.is_command(changes) else {})
-        values = parameters.checked({**self.values, **{
-            name: value for name, value in changes.items() if name not in command}})
-        if self._follows and parameters.is_enabled('clock', values):
+        values = parameters.checked({**self.values_next, **others})
+        if self.clock.follows and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
-        rest = sorted(changes.keys() - SPIN)
         try:                # what may be refused comes first
-            if rest:
+            if others:
                 self._topics.open(values)
             if command:
                 self._command(command)
         except Exception:
-            self._topics.open(self.values)
+            self._topics.open(self.values_next)
             raise
-        if rest:
-            self.loop.set_parameters(values, {name: values[name] for name in rest})
+        if others:          # a spin among them is that of the next start
+            self.loop.set_parameters(values, {name: values[name] for name in sorted(
+                others.keys() - SPIN)})
             self._align_ticks()
-        self.values = values
+        self.values_next = values
 
-    def _command(self, command: Mapping[str, float]) -> None:
+    def _command(self, given: Mapping[str, Any]) -> None:
+        command = parameters.checked_changes(given)
         # The motion goes on with what is not commanded.
         self.loop.change('command', lambda: {
             name.removeprefix('spin.'): command.get(name, present)
@@ -243,10 +246,10 @@ class Simulator(Node):
     @property
     def step_ns(self) -> int:
         """The length of a step: whole nanoseconds, so that n steps are n times one step."""
-        return round(self.values['step.dt'] * NANOSECONDS)
+        return round(self.values_next['step.dt'] * NANOSECONDS)
 
     def _step(self, _: Trigger.Request) -> str:
-        self.loop.step(self.values['step.count'] * self.step_ns)
+        self.loop.step(self.values_next['step.count'] * self.step_ns)
         return self.loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:
@@ -260,13 +263,14 @@ class Simulator(Node):
         Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
         motion begins with the present parameters; nothing changes then.
         """
-        self.loop.reset(self.values, paused)
+        self.loop.reset(self.values_next, paused)
         self._align_ticks()
         self.show_spin()
 
     def _spin(self) -> dict[str, float]:
         """Return the present spin, by the names of its parameters."""
-        return dict(zip(SPIN, self.simulation.trajectory.momenta(self.loop.now_ns), strict=True))
+        simulation = self.simulation
+        return dict(zip(SPIN, simulation.trajectory.momenta(simulation.now_ns), strict=True))
 
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
@@ -286,7 +290,7 @@ class Simulator(Node):
         elif self.loop.state is LoopState.WAITING:
             answer(False, self.loop.state.value)
         else:
-            self._recording.start(self.values, answer)
+            self._recording.start(self.values_next, answer)
         return future
 
     def _publish_diagnostics(self) -> None:

@@ -54,13 +54,14 @@ class Recording:
         channels = recorded(simulation.channels, values)
         recorder = Recorder(
             values['record.uri'], [RecordedTopic(*topic) for topic in self._topics(channels)],
-            partial(run_metadata, simulation.values, simulation.epoch_ns, simulation.now_ns,
-                    (event.as_mapping() for event in tuple(simulation.history)), values),
+            partial(run_metadata, simulation.values_at_start, simulation.epoch_ns,
+                    simulation.sent_ns, (
+                        event.as_mapping() for event in tuple(simulation.history)), values),
             max_loss=values['record.max_loss'], compression=values['record.compression'],
             min_free_bytes=values['record.min_free_bytes'], **self._options)
         self.error, self._recorder, self._events_index = None, recorder, len(channels)
         simulation.log_to(recorder.write, channels)
-        self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
+        self.write(Event('start', simulation.now_ns, simulation.sent_ns))
         return recorder
 
     def end(self, answer: Answer = lambda *_: None, error: str | None = None) -> None:

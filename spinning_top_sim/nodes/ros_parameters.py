@@ -93,7 +93,8 @@ def _with_type(name: str, value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def is_command(changes: Mapping[str, Any]) -> bool:
-    """Return whether changes command the spin; beside `initial.*` it is that of the next start."""
-    return not changes.keys().isdisjoint(SPIN) and not any(
-        name.startswith('initial.') for name in changes)
+def commanded(changes: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the spin that changes command, none beside `initial.*`, and the other changes."""
+    command = {} if any(name.startswith('initial.') for name in changes) else {
+        name: changes[name] for name in SPIN if name in changes}
+    return command, {name: value for name, value in changes.items() if name not in command}

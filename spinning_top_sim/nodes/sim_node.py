@@ -57,7 +57,7 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], Any]]:
 
     def make_node() -> Any:
         node = Simulator(given)
-        if node.values['simulation_interfaces'] and find_spec('simulation_interfaces'):
+        if node.values_next['simulation_interfaces'] and find_spec('simulation_interfaces'):
             from spinning_top_sim.nodes import simulation_handlers  # noqa: PLC0415
             simulation_handlers.offer(node)
         return node

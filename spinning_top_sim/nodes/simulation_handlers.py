@@ -113,7 +113,7 @@ class SimulationHandlers:
         if state in (LoopState.RUNNING, LoopState.ENDED):
             return 'PLAYING' if state is LoopState.RUNNING else 'QUITTING'
         # A motion that has failed is PAUSED, too.
-        return 'STOPPED' if self._simulation.now_ns < 0 and not self._loop.failure else 'PAUSED'
+        return 'STOPPED' if self._simulation.sent_ns < 0 and not self._loop.failure else 'PAUSED'
 
     def _get_simulation_state(self, _: Message, response: Message) -> str:
         response.state.state = getattr(response.state, f'STATE_{self._state}')
@@ -143,13 +143,13 @@ class SimulationHandlers:
             raise ValueError(f'steps = {request.steps}: must be >= 1')
         if self._state != 'PAUSED':
             raise RuntimeError(f'the simulation is {self._state}: must be PAUSED')
-        end_ns = loop.now_ns + length_ns
+        end_ns = self._simulation.now_ns + length_ns
         loop.step(length_ns)
-        if loop.now_ns < end_ns:
+        if self._simulation.now_ns < end_ns:
             raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
     def _reset_simulation(self, request: Message, _: Message) -> None:
-        values, time_and_state = self._node.values, request.SCOPE_TIME | request.SCOPE_STATE
+        values, time_and_state = self._node.values_next, request.SCOPE_TIME | request.SCOPE_STATE
         if request.scope in (request.SCOPE_DEFAULT, request.SCOPE_ALL, time_and_state):
             self._node.start_again()
         elif request.scope == request.SCOPE_STATE:
@@ -186,9 +186,9 @@ class SimulationHandlers:
 
     def _fill(self, message: Message) -> None:
         """Write the present state into an EntityState, in the world frame."""
-        now, stamp_ns = self._simulation.state(), self._simulation.epoch_ns + self._loop.now_ns
-        message.header = Header(stamp=Time(nanoseconds=stamp_ns).to_msg(),
-                                frame_id=self._node.values['world_frame'])
+        simulation, now = self._simulation, self._simulation.state()
+        stamp = Time(nanoseconds=simulation.epoch_ns + simulation.now_ns).to_msg()
+        message.header = Header(stamp=stamp, frame_id=self._node.values_next['world_frame'])
         rotation, pivot = now.rows_quaternion, now.pivot
         for target, rows in (
                 (message.pose.orientation, rotation),
@@ -205,7 +205,7 @@ class SimulationHandlers:
         if not (getattr(request, 'set_pose', True) or getattr(request, 'set_twist', True)):
             raise ValueError('set_pose and set_twist are false: one of them must be true; the '
                              'acceleration follows from pose and twist')
-        frame, given = self._node.values['world_frame'], request.state.header.frame_id
+        frame, given = self._node.values_next['world_frame'], request.state.header.frame_id
         if given not in ('', frame):
             raise self._unsupported(f'header.frame_id = {given!r}: must be {frame!r} or empty')
         self._set_state(partial(self._requested, request, response))

@@ -52,7 +52,7 @@ class NodeStatus:
             (recording.error, ERROR, f'recording: {recording.error}'),
             (loop.failure, ERROR, loop.failure))
         _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
-        now_ns, motion = loop.now_ns, simulation.trajectory
+        now_ns, motion = simulation.now_ns, simulation.trajectory
         numbers = {
             STATE: loop.state.name.lower(),
             TIME: f'{now_ns / NANOSECONDS:.6f}',
@@ -79,7 +79,7 @@ class NodeStatus:
 
     def _energy_drift(self) -> float:
         """Return the relative drift since the motion began, absolute where its energy was 0."""
-        piece = self._simulation.trajectory.after(self._loop.now_ns)
+        piece = self._simulation.trajectory.after(self._simulation.now_ns)
         return float(relative_drift(self._simulation.state().energy, piece.energy)[0])
 
     def _measure_speed(self, now_ns: int) -> float:
@@ -93,13 +93,13 @@ class NodeStatus:
 
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
-        simulation, loop = self._simulation, self._loop
-        motion, state = simulation.trajectory, loop.state.name.lower()
-        regime, (l3, lz) = motion.after(loop.now_ns).describe(), motion.momenta(loop.now_ns)
+        simulation, state = self._simulation, self._loop.state.name.lower()
+        motion, now_ns = simulation.trajectory, simulation.now_ns
+        regime, (l3, lz) = motion.after(now_ns).describe(), motion.momenta(now_ns)
         theta = math.degrees(float(simulation.state().theta[0]))
         # The most important parts come first: a terminal shows as much as fits.
         return ' | '.join((
-            f't {loop.now_ns / NANOSECONDS:9.2f} s {state}', regime.name if regime else '-',
-            f'theta {theta:6.2f} deg', f'x{self._measure_speed(loop.now_ns):.2f}',
+            f't {now_ns / NANOSECONDS:9.2f} s {state}', regime.name if regime else '-',
+            f'theta {theta:6.2f} deg', f'x{self._measure_speed(now_ns):.2f}',
             f'{self._total("sent")} messages published',
             f'L3 {l3:.4g} Lz {lz:.4g}', f'energy drift {self._energy_drift():+.0e}'))

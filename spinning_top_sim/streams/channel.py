@@ -63,7 +63,7 @@ class Samples:
     @cached_property
     def exact(self) -> tuple[Vector, Vector]:
         """Rates [rad/s] and forces [m/s^2] of a perfect IMU: values or means."""
-        return self._means if self._imu.takes_means else self._imu.mounting.felt(self.states)
+        return self._means if self._imu.takes_means else self._imu.mounting.true(self.states)
 
     @cached_property
     def readings(self) -> tuple[Vector, Vector]:
@@ -71,7 +71,7 @@ class Samples:
         imu, felt = self._imu, self.exact
         if imu.low_pass is not None:
             w1, w2, w3, f1, f2, f3 = imu.low_pass.filtered(
-                self.trajectory, self.t_ns, lambda states: [*chain(*imu.mounting.felt(states))])
+                self.trajectory, self.t_ns, lambda states: [*chain(*imu.mounting.true(states))])
             felt = (w1, w2, w3), (f1, f2, f3)
         felt = imu.vibrating(felt, self.t_ns, self._seconds if imu.takes_means else 0.0)
         return imu.read(felt, self.errors)

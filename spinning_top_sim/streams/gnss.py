@@ -39,7 +39,7 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
             """Return status, position (NaN in an outage), covariance and its kind."""
             from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
             position = _measured(values, deviations, Kind.GNSS_POSITION, samples,
-                                 samples.trajectory.place(samples.t_ns).position)
+                                 samples.trajectory.pivot_at(samples.t_ns).position)
             out = _is_out(edges_ns, samples.t_ns)
             return ([np.where(out, NO_FIX, FIX)],
                     [np.where(out, np.nan, part)
@@ -60,7 +60,7 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
                 Numbers('d', (*messages.ORIGIN, *covariance))),
             fields=lambda samples: [list(_measured(
                 values, deviations, Kind.GNSS_VELOCITY, samples,
-                samples.trajectory.place(samples.t_ns).velocity))], **more)
+                samples.trajectory.pivot_at(samples.t_ns).velocity))], **more)
 
     of_fix, of_velocity = ((level, level, vertical) for level, vertical in (
         values['gnss.position_noise'], values['gnss.velocity_noise']))

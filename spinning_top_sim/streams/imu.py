@@ -56,7 +56,7 @@ class Mounting:
         inverse = -x, -y, -z, w
         return attitude.product(orientation, inverse), attitude.rotated_back(inverse, rates)
 
-    def felt(self, states: States) -> tuple[Vector, Vector]:
+    def true(self, states: States) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the sensor's frame."""
         return (self.from_body(states.rows_angular_velocity),
                 self.from_body(states.specific_force(self.lever_arm)))
@@ -168,7 +168,7 @@ class Magnetometer(Sensor):
         """Return the field [T] in frames with these orientations in the world."""
         return attitude.rotated_back(orientation, self._field)
 
-    def felt(self, orientation: Quaternion, t_ns: Times) -> Vector:
+    def disturbed(self, orientation: Quaternion, t_ns: Times) -> Vector:
         """Return the field [T] with the disturbances at times (n,) [ns]."""
         true, (world, body) = self.true(orientation), self._disturbances
         if any(map(any, world)):

@@ -2,7 +2,7 @@
 """
 A simulation that sends its messages in time.
 
-Messages up to `now_ns` are sent.  The channels of one grid are computed together, a short time
+Messages up to `sent_ns` are sent.  The channels of one grid are computed together, a short time
 ahead, and wait as rows.  An event, another rate or another listener drops what waits.
 """
 
@@ -30,7 +30,7 @@ FIRST_STRIDE_NS = 1_000     # of the motion, whose pace is not known before it i
 PIECE_SECONDS = 1e-2        # of computing between two calls of give_way, half of it for the solver
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
-# Messages of a topic for a log: its number there, stamps (n,) [ns], messages (n, size).
+# Messages of a topic for a log: its number there, log times (n,) [ns], messages (n, size).
 LogRows = tuple[int, Times, Rows]
 
 
@@ -54,7 +54,7 @@ class Output:
     skipped: int = 0
     failed: int = 0
     # Log times [ns], as an array and as a list, and messages; so many of them are sent.
-    _stamps: Times = field(default_factory=lambda: np.empty(0, np.int64))
+    _log_times: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     _taken: int = 0
@@ -65,18 +65,19 @@ class Output:
         """Whether anybody takes the messages: else they are not computed."""
         return self.publish is not None or self.log_index is not None
 
-    def add(self, stamps: Times, rows: Rows) -> None:
+    def add(self, log_times: Times, rows: Rows) -> None:
         """Put messages behind those that wait."""
         if self._taken < len(self._times):
-            stamps = np.concatenate((self._stamps[self._taken:], stamps))
+            log_times = np.concatenate((self._log_times[self._taken:], log_times))
             rows = np.concatenate((self._rows[self._taken:], rows))
-        self._stamps, self._times, self._rows, self._taken = stamps, stamps.tolist(), rows, 0
+        self._log_times, self._times, self._rows = log_times, log_times.tolist(), rows
+        self._taken = 0
 
     def take(self, until_ns: int) -> tuple[Times, list[int], Rows]:
         """Return what waits up to a log time [ns], which waits no longer."""
         begin, end = self._taken, bisect_right(self._times, until_ns, self._taken)
         self._taken = end
-        return self._stamps[begin:end], self._times[begin:end], self._rows[begin:end]
+        return self._log_times[begin:end], self._times[begin:end], self._rows[begin:end]
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -93,12 +94,12 @@ class Output:
 
 
 @dataclass(eq=False)
-class _Group:
-    """Outputs of one grid, computed together; without outputs: the motion itself."""
+class _Progress:
+    """How far the motion is computed, or the messages of the `outputs` of one grid."""
 
-    outputs: Mapping[Channel, Output]
     computed_ns: int
     span_ns: int            # that is computed at once
+    outputs: Mapping[Channel, Output] = field(default_factory=dict)
 
 
 class LiveSimulation(Simulation):
@@ -115,12 +116,12 @@ class LiveSimulation(Simulation):
         self.outputs = [Output(channel, clock=clock) for channel in self.channels]
         self._clock = clock
         self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
-        self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
+        self._motion = _Progress(self.sent_ns, FIRST_STRIDE_NS)
         self.refresh()
 
     def log_to(self, write: Callable[[Sequence[LogRows]], object] | None,
                channels: Sequence[Channel] = ()) -> None:
-        """Record these channels, numbered in this order, and no others after `now_ns`."""
+        """Record these channels, numbered in this order, and no others after `sent_ns`."""
         self._write = write or self._write
         for output in self.outputs:
             output.log_index = (channels.index(output.channel) if output.channel in channels
@@ -128,13 +129,13 @@ class LiveSimulation(Simulation):
         self.refresh()
 
     def apply(self, kind: str, **details: Any) -> Event:
-        if self.now_ns < 0 and kind in MOTIONS:     # the sample of t = 0 comes before them
+        if self.sent_ns < 0 and kind in MOTIONS:     # the sample of t = 0 comes before them
             self.send(0)
         event = super().apply(kind, **details)
         for output, channel in zip(self.outputs, self.channels, strict=True):
             output.channel = channel
         if event.begins_motion or kind == 'reset':
-            self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
+            self._motion = _Progress(self.sent_ns, FIRST_STRIDE_NS)
         self.refresh()
         return event
 
@@ -143,17 +144,17 @@ class LiveSimulation(Simulation):
         # Those that are used, with their numbers.
         self._used = [(number, output) for number, output in enumerate(self.outputs)
                       if output.is_used]
-        grids: dict[tuple[int, int], dict[Channel, Output]] = {}
+        outputs_of: dict[tuple[int, int], dict[Channel, Output]] = {}
         for _, output in self._used:
             output.take(NEVER_NS)
-            grids.setdefault(output.channel.grid, {})[output.channel] = output
-        self._groups = [_Group(outputs, self.now_ns, FIRST_SPAN_NS)
-                        for outputs in grids.values()]
+            outputs_of.setdefault(output.channel.grid, {})[output.channel] = output
+        self._grids = [_Progress(self.sent_ns, FIRST_SPAN_NS, outputs)
+                       for outputs in outputs_of.values()]
 
     @property
     def _ready_ns(self) -> int:
         """Time up to which all messages are sent or wait [ns]."""
-        return min(group.computed_ns for group in self._groups or [self._motion])
+        return min(one.computed_ns for one in self._grids or [self._motion])
 
     def send(self, due_ns: int, publish_from_ns: int = 0,
              give_way: Callable[[], bool] = lambda: False) -> bool:
@@ -165,65 +166,65 @@ class LiveSimulation(Simulation):
 
         Raises IntegrationError if the motion does not go on; what comes before is sent.
         """
-        while self.now_ns < due_ns:
+        while self.sent_ns < due_ns:
             if self._ready_ns < due_ns:
                 # No further than is computed next: a solver keeps a limited number of steps.
-                self._go_on(self._groups, min([due_ns, *(
-                    one.computed_ns + one.span_ns for one in self._groups)]), PIECE_SECONDS)
+                self._go_on(self._grids, min([due_ns, *(
+                    one.computed_ns + one.span_ns for one in self._grids)]), PIECE_SECONDS)
             self._send(min(due_ns, self._ready_ns), publish_from_ns)
-            if self.now_ns < due_ns and give_way():
+            if self.sent_ns < due_ns and give_way():
                 return False
         return True
 
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """Compute some of what is due up to a time, for one grid; it may take so long."""
-        if self._groups and self._ready_ns < until_ns:
-            behind = min(self._groups, key=attrgetter('computed_ns'))
+        if self._grids and self._ready_ns < until_ns:
+            behind = min(self._grids, key=attrgetter('computed_ns'))
             span_ns = min(behind.span_ns, LONGEST_SPAN_NS)
             with contextlib.suppress(IntegrationError):     # `send` meets it in time
                 self._go_on([behind], behind.computed_ns + span_ns, seconds)
 
-    def _go_on(self, groups: Sequence[_Group], goal_ns: int, seconds: float) -> None:
-        """Compute groups up to a time, or a part; raise where all is sent that the motion has."""
+    def _go_on(self, grids: Sequence[_Progress], goal_ns: int, seconds: float) -> None:
+        """Compute grids up to a time, or a part; raise where all is sent that the motion has."""
         try:
             self._compute(self._motion, goal_ns, 0.5 * seconds)
         except IntegrationError:
-            if self.now_ns >= self._motion.computed_ns:
+            if self.sent_ns >= self._motion.computed_ns:
                 raise
-        for group in groups:
-            self._compute(group, min(goal_ns, self._motion.computed_ns), seconds)
+        for grid in grids:
+            self._compute(grid, min(goal_ns, self._motion.computed_ns), seconds)
         self.forget()
 
-    def _compute(self, group: _Group, until_ns: int, seconds: float) -> None:
-        """Compute the messages of a group up to a time, or for about so long."""
+    def _compute(self, part: _Progress, until_ns: int, seconds: float) -> None:
+        """Compute the motion or the messages of a grid up to a time, or for about so long."""
         now = begin = self._clock()
-        while group.computed_ns < until_ns and now < begin + seconds:
-            goal_ns = min(until_ns, group.computed_ns + group.span_ns)
-            if group is self._motion:
-                goal_ns = self.reach(group.computed_ns, goal_ns)
-            for channel, t_ns, rows in self.messages(group.outputs, group.computed_ns, goal_ns):
-                group.outputs[channel].add(self.epoch_ns + t_ns, rows)
-            done_ns, called = goal_ns - group.computed_ns, now
-            group.computed_ns, now = goal_ns, self._clock()
+        while part.computed_ns < until_ns and now < begin + seconds:
+            goal_ns = min(until_ns, part.computed_ns + part.span_ns)
+            if part is self._motion:
+                goal_ns = self.reach(part.computed_ns, goal_ns)
+            for channel, t_ns, rows in self.messages(part.outputs, part.computed_ns, goal_ns):
+                part.outputs[channel].add(self.epoch_ns + t_ns, rows)
+            done_ns, called = goal_ns - part.computed_ns, now
+            part.computed_ns, now = goal_ns, self._clock()
             # Where it took too long, the next piece is a half of it, else up to twice as long.
-            group.span_ns = (max(1, done_ns // 2) if now - called > 0.5 * seconds
-                             else max(group.span_ns, 2 * done_ns))
+            part.span_ns = (max(1, done_ns // 2) if now - called > 0.5 * seconds
+                            else max(part.span_ns, 2 * done_ns))
 
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
         logged: list[LogRows] = []
         due: list[tuple[int, int, NDArray[np.uint8]]] = []
         for number, output in self._used:
-            stamps, times, rows = output.take(self.epoch_ns + until_ns)
+            log_times, times, rows = output.take(self.epoch_ns + until_ns)
             if times and output.log_index is not None:
-                logged.append((output.log_index, stamps, rows))
+                logged.append((output.log_index, log_times, rows))
             if output.publish is not None:
                 late = bisect_left(times, self.epoch_ns + publish_from_ns)
                 output.skipped += late
                 due += zip(times[late:], repeat(number), rows[late:])
         if logged:
             self._write(logged)
-        self.now_ns = until_ns
+        self.sent_ns = until_ns
         due.sort(key=itemgetter(0, 1))
         for _, number, row in due:
             self.outputs[number].send(row.tobytes())

@@ -44,7 +44,7 @@ def markers(values: Mapping[str, Any]) -> Channel:
                                     return_inverse=True)
         t_ns, tip = numbers * spacing_ns, (0.0, 0.0, shape.tip)
         points = (np.stack(rotated(samples.trajectory.exact_attitude(t_ns), tip))
-                  + samples.trajectory.place(t_ns).position).T
+                  + samples.trajectory.pivot_at(t_ns).position).T
         traces = points[places.reshape(len(newest), -1)]
         now = np.stack(states.position(tip), axis=-1)[:, np.newaxis]
         traces = np.where(np.isnan(traces), now, traces)

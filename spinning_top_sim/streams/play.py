@@ -33,10 +33,11 @@ class Simulation:
     """
     One top in motion.  Times are integer nanoseconds since the start.
 
-    values : checked parameters of the run, as it started
+    values_at_start : checked parameters of the run, as it started
+    values_in_effect : these, with the changes that take effect at once
     trajectory : the motion
     imu, channels : the sensor and all streams, with their present rates
-    now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
+    sent_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
     history : the events since the start
     epoch_ns : stamp of t = 0 [ns]
 
@@ -58,13 +59,18 @@ class Simulation:
         imu = Imu(values, period_ns(values['imu.rate']))
         self.channels = all_channels(values, imu)
         self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
-        self.values = dict(values)
-        self._present = dict(values)        # with the changes that take effect at once
+        self.values_at_start = dict(values)
+        self.values_in_effect = dict(values)
         self.history: list[Event] = []
-        self.now_ns = -1
+        self.sent_ns = -1
         # The trace of the markers and late fixes reach back across events.
         self._keep_ns = max(round(values[name] * NANOSECONDS) for name in (
             'markers.trace_length', 'gnss.latency'))
+
+    @property
+    def now_ns(self) -> int:
+        """The simulated time [ns], >= 0: up to here samples are sent."""
+        return max(self.sent_ns, 0)
 
     def apply(self, kind: str, **details: Any) -> Event:
         """
@@ -75,14 +81,14 @@ class Simulation:
 
         Raises ValueError naming what is off; the run goes on unchanged.
         """
-        sent_ns = self.now_ns
+        sent_ns = self.sent_ns
         if kind == 'reset':
             self._restart(details['parameters'], details['epoch_ns'])
             return Event(kind, 0, sent_ns, details)
-        event = Event(kind, max(sent_ns, 0), sent_ns, details)
+        event = Event(kind, self.now_ns, sent_ns, details)
         if event.begins_motion:
             self.trajectory = self.trajectory.then(event)
-            self.now_ns = event.t_ns
+            self.sent_ns = event.t_ns
         elif kind == 'parameters':
             self._take_over(details)
         elif kind == 'epoch':
@@ -97,10 +103,11 @@ class Simulation:
         return event
 
     def _take_over(self, changes: Mapping[str, Any]) -> None:
-        """Make the channels after `now_ns` of the changes that take effect at once."""
-        self._present |= {name: changes[name] for name in parameters.AT_ONCE & changes.keys()}
-        self.imu = self.imu.at_period(period_ns(self._present['imu.rate']), max(self.now_ns, 0))
-        self.channels = all_channels(self._present, self.imu)
+        """Make the channels after `sent_ns` of the changes that take effect at once."""
+        values = self.values_in_effect
+        values |= {name: changes[name] for name in parameters.AT_ONCE & changes.keys()}
+        self.imu = self.imu.at_period(period_ns(values['imu.rate']), self.now_ns)
+        self.channels = all_channels(values, self.imu)
 
     def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:
         """
@@ -114,14 +121,13 @@ class Simulation:
                              f'{parameters.FASTEST:g} m/s')
         if self.trajectory.pivot is None and not any(target):
             return None
-        timeout = self.values['pivot.cmd_timeout']      # 0: for ever
-        stop_ns = max(self.now_ns, 0) + round(timeout * NANOSECONDS) if timeout else NEVER_NS
+        timeout = self.values_at_start['pivot.cmd_timeout']      # 0: for ever
+        stop_ns = self.now_ns + round(timeout * NANOSECONDS) if timeout else NEVER_NS
         return {'x': x, 'y': y, 'z': z, 'stop_ns': stop_ns}
 
     def state(self) -> States:
-        """Return the state (n = 1) in which the motion goes on after `now_ns`."""
-        now_ns = max(self.now_ns, 0)
-        return self.trajectory.after(now_ns).states(np.array([now_ns]))
+        """Return the state (n = 1) in which the motion goes on after `sent_ns`."""
+        return self.trajectory.after(self.now_ns).states(np.array([self.now_ns]))
 
     def reach(self, after_ns: int, until_ns: int) -> int:
         """
@@ -171,16 +177,16 @@ class Simulation:
         """
         per_ns = sum(len(channel.template) / channel.period_ns for channel in channels)
         span_ns = max(1, int(BLOCK_BYTES / max(per_ns, BLOCK_BYTES / LONGEST_BLOCK_NS)),
-                      (until_ns - self.now_ns) // MOST_BLOCKS)
-        while self.now_ns < until_ns:
-            end_ns = self.reach(self.now_ns, min(until_ns, self.now_ns + span_ns))
-            messages = self.messages(channels, self.now_ns, end_ns)
-            self.now_ns = end_ns
+                      (until_ns - self.sent_ns) // MOST_BLOCKS)
+        while self.sent_ns < until_ns:
+            end_ns = self.reach(self.sent_ns, min(until_ns, self.sent_ns + span_ns))
+            messages = self.messages(channels, self.sent_ns, end_ns)
+            self.sent_ns = end_ns
             yield Block(end_ns, messages)
             self.forget()
 
     def forget(self) -> None:
-        """Forget what no sample after `now_ns` needs."""
+        """Forget what no sample after `sent_ns` needs."""
         memory_ns = self.imu.memory_ns
-        self.trajectory.forget(self.now_ns - max(self._keep_ns, memory_ns),
-                               self.now_ns - memory_ns)
+        self.trajectory.forget(self.sent_ns - max(self._keep_ns, memory_ns),
+                               self.sent_ns - memory_ns)

@@ -41,7 +41,7 @@ def _odometry(samples: Samples) -> Sequence[Values]:
 def _imu_odometry(mounting: Mounting, samples: Samples) -> Sequence[Values]:
     states, arm = samples.states, mounting.lever_arm
     return (states.position(arm), samples.orientation,
-            mounting.from_body(states.world_velocity(arm)), mounting.felt(states)[0])
+            mounting.from_body(states.world_velocity(arm)), mounting.true(states)[0])
 
 
 def _joints(samples: Samples) -> Sequence[Values]:
@@ -68,7 +68,7 @@ def _invariants(samples: Samples) -> Sequence[Values]:
 
 
 def _magnetic_field(sensor: Magnetometer, samples: Samples) -> Sequence[Values]:
-    field = sensor.felt(samples.orientation, samples.t_ns)
+    field = sensor.disturbed(samples.orientation, samples.t_ns)
     return (sensor.read(field, sensor.errors(samples.t_ns)),
             messages.diagonal(*3 * (sensor.variance,)))
 

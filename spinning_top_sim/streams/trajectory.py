@@ -46,7 +46,8 @@ class Trajectory:
                  settings: Mapping[str, Any], *, most_acceleration: float) -> None:
         self.top, self.pivot = top, pivot
         self._settings, self._most_acceleration = settings, most_acceleration
-        self._drive: Event | None = None            # the newest, while the pivot follows it
+        self._drive: Event | None = None            # the newest
+        self._path_until: Callable[..., PivotPath]  # of it, by its `stop_ns`
         self._jumps: tuple[int, ...] = ()           # when the angular velocity jumps
         self._forgotten = 0, 0                      # steps and evaluations of pieces that are gone
         self._pieces = [self._begin(start, 0)]
@@ -143,7 +144,7 @@ class Trajectory:
         """Return `energy`, `l3` or `lz` as it is at the start of the piece of each time, (n,)."""
         return self._joined(lambda piece, times: np.full(len(times), getattr(piece, name)), t_ns)
 
-    def place(self, t_ns: Times) -> Kinematics:
+    def pivot_at(self, t_ns: Times) -> Kinematics:
         """Return what the pivot does at times (n,), without its motion being solved."""
         return Kinematics(*self._joined(lambda piece, times: kinematics(piece.ride, times), t_ns))
 
@@ -159,25 +160,25 @@ class Trajectory:
 
     def then(self, event: Event) -> Self:
         """Return the trajectory that follows an event from its time on.  Raises ValueError."""
-        after, now, t_ns = copy(self), self.after(event.t_ns), event.t_ns
-        after._pieces = self._pieces[:self._pieces.index(now) + 1]
+        changed, now, t_ns = copy(self), self.after(event.t_ns), event.t_ns
+        changed._pieces = self._pieces[:self._pieces.index(now) + 1]
         if event.kind == 'drive':
-            after._follow(event, now)
+            changed._follow(event, now)
         else:
             start = (State(**event.details) if event.kind == 'state'
                      else commanded(now.states(np.array([t_ns])), **event.details))
-            after._pieces.append(self._begin(start, t_ns))
-            after._jumps = *self._jumps, t_ns
-        return after
+            changed._pieces.append(self._begin(start, t_ns))
+            changed._jumps = *self._jumps, t_ns
+        return changed
 
     def _follow(self, drive: Event, now: Piece) -> None:
         t_ns, details = drive.t_ns, drive.details
         repeats = self._drive is not None and drive.repeats(self._drive)
         if not repeats:
-            place = self.place(np.array([t_ns]))
+            at = self.pivot_at(np.array([t_ns]))
             self._path_until = partial(
                 PivotPath.to_velocity, [details[axis] for axis in 'xyz'],
-                position=place.position[:, 0].tolist(), velocity=place.velocity[:, 0].tolist(),
+                position=at.position[:, 0].tolist(), velocity=at.velocity[:, 0].tolist(),
                 start_ns=t_ns, most_acceleration=self._most_acceleration)
         self._drive, self.pivot = drive, self._path_until(stop_ns=details['stop_ns'])
         if repeats:         # the motion up to now is the same

@@ -142,11 +142,11 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
         """Yield the blocks up to a time, as far as the equations and the limit go."""
         nonlocal count
         # An event before the first sample has the time 0, and what is sent then the time -1.
-        if not max(simulation.now_ns, 0) <= max(t_ns, 0) <= run.log_end_ns - simulation.epoch_ns:
+        if not simulation.now_ns <= max(t_ns, 0) <= run.log_end_ns - simulation.epoch_ns:
             raise ValueError(f't = {t_ns} ns: out of order, or behind the end of the log')
         channels = [channel for channel in simulation.channels
                     if recorded and samples and channel.topic in run.topics]
-        count += sum(len(one.times(simulation.now_ns, t_ns)) for one in channels)
+        count += sum(len(one.times(simulation.sent_ns, t_ns)) for one in channels)
         if count > limit:
             raise too_much
         with contextlib.suppress(IntegrationError):
@@ -154,14 +154,14 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
                 yield simulation, block
                 if simulation.trajectory.steps > limit:
                     raise too_much
-        simulation.now_ns = t_ns
+        simulation.sent_ns = t_ns
 
     for event in run.history:               # before the recording
         yield from play(event.t_ns, recorded=False)
         simulation.apply(event.kind, **event.details)
     yield from play(run.begun_ns, recorded=False)
     simulation.apply('parameters', **run.changes_at_once)
-    yield simulation, Logged(run.epoch_ns, Event('start', 0, simulation.now_ns))
+    yield simulation, Logged(run.epoch_ns, Event('start', 0, simulation.sent_ns))
     for logged in run.events:
         event = logged.event
         if event.kind != 'start' and (event.kind != 'parameters'
@@ -169,4 +169,4 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
             yield from play(event.sent_ns, recorded=True)
             simulation.apply(event.kind, **event.details)
             yield simulation, logged
-    yield from play(max(end_ns - simulation.epoch_ns, simulation.now_ns), recorded=True)
+    yield from play(max(end_ns - simulation.epoch_ns, simulation.sent_ns), recorded=True)

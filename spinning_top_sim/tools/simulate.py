@@ -90,7 +90,7 @@ def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Se
     pivot_moves = simulation.trajectory.pivot is not None
     units = RIDE_UNITS if pivot_moves else UNITS
     row = Template(Field('row', len(units)))
-    table = Channel('table', '', '', period_ns(simulation.values['pose.rate']), row,
+    table = Channel('table', '', '', period_ns(simulation.values_at_start['pose.rate']), row,
                     lambda samples: [columns(samples.t_ns / NANOSECONDS, samples.states,
                                              pivot_moves=pivot_moves)])
     write = write_csv if file_format == 'csv' else write_parquet
@@ -127,7 +127,7 @@ def _play(simulation: Simulation, channels: Sequence[Channel], stops: Sequence[S
     for stop_ns, momenta in stops:
         for block in simulation.play(channels, stop_ns):
             yield block
-            show(simulation.now_ns / NANOSECONDS)
+            show(simulation.sent_ns / NANOSECONDS)
         if momenta is not None:
             l3, lz = momenta
             try:
@@ -145,7 +145,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
 
     After an error the log is closed and readable, and holds what was computed before.
     """
-    values, epoch_ns = simulation.values, simulation.epoch_ns
+    values, epoch_ns = simulation.values_at_start, simulation.epoch_ns
     channels = recorded(simulation.channels, values)
     types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
     topics = list(types)
@@ -170,7 +170,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                 add(done)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(f'{path} holds the run up to t = '
-                                f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
+                                f'{simulation.sent_ns / NANOSECONDS:g} s') from interrupt
     finally:
         file.finish()
     return f'{file.message_counts.total()} messages, {file.size / 1e6:.1f} MB'

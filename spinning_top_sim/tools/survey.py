@@ -55,8 +55,8 @@ class Motion:
     def __init__(self, cause: str, simulation: Simulation, topics: Mapping[str, str], *,
                  with_exact: bool) -> None:
         self.cause = cause
-        self.begin_ns = self.end_ns = simulation.epoch_ns + simulation.now_ns
-        piece = simulation.trajectory.after(max(simulation.now_ns, 0))
+        self.begin_ns = self.end_ns = simulation.epoch_ns + simulation.sent_ns
+        piece = simulation.trajectory.after(simulation.now_ns)
         self.l3, self.lz, self.energy = piece.l3, piece.lz, piece.energy
         self.exact = piece.describe() if with_exact else None
         # The source has the most samples in a nutation, up to those that suffice.

@@ -98,7 +98,7 @@ def _compute(run: RunDescription, end_ns: int, waiting: _Waiting,
                 waiting[done.stamp_ns, run.topics[events.COMMANDS]][1].append(
                     (events.COMMAND, dict(done.event.entries())[events.COMMANDS]))
             # Not up to it: another command at this very time may follow.
-            yield simulation.epoch_ns + simulation.now_ns
+            yield simulation.epoch_ns + simulation.sent_ns
     except MALFORMED as error:
         result.stopped = reason_of(error)
     else:

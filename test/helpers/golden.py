@@ -54,8 +54,9 @@ def columns(case):
     from spinning_top_sim.streams.play import Simulation
 
     values = {name: False for name in parameters.BY_NAME if name.endswith('.enabled')}
-    run = Simulation(parameters.checked({**values, 'seed': 7, **CASES[case]}), 10 ** 18)
-    channels = [one for one in run.channels if parameters.is_enabled(one.name, run.values)]
+    values = parameters.checked({**values, 'seed': 7, **CASES[case]})
+    run = Simulation(values, 10 ** 18)
+    channels = [one for one in run.channels if parameters.is_enabled(one.name, values)]
     data = {one.topic: [] for one in channels}
     for block in run.play(channels, round(SECONDS * 1e9)):
         for channel, _, rows in block.messages:

@@ -109,7 +109,7 @@ class OwnNode(InThisProcess):
             pair.key: pair.value for pair in status.values}
 
     def wait_until(self, t_ns):
-        self.spin_until(f't = {t_ns} ns', lambda: self.simulation.now_ns >= t_ns)
+        self.spin_until(f't = {t_ns} ns', lambda: self.simulation.sent_ns >= t_ns)
 
 
 def dotted(values):

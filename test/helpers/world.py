@@ -36,7 +36,7 @@ class Place(NamedTuple):
     """How far a run has come: how many resets, up to which time messages are sent, and events."""
 
     motion: int
-    now_ns: int
+    sent_ns: int
     events: int
 
 
@@ -105,13 +105,13 @@ class World:
         self.loop = Loop(
             self.simulation, self.values, self.recording,
             SimulatedClock(self._source if follows else self._date, str,
-                           (lambda: 1) if follows else None, self._steady),
+                           follows=follows, steady=self._steady),
             error=str, update_subscribers=self._update_subscribers)
 
     @property
     def place(self):
         return Place(sum(event.kind == 'reset' for event in self.events),
-                     self.simulation.now_ns, len(self.events))
+                     self.simulation.sent_ns, len(self.events))
 
     def _apply(self, kind, **details):
         event = LiveSimulation.apply(self.simulation, kind, **details)
@@ -291,7 +291,7 @@ class World:
         if plan.keeps_time and loop.state is LoopState.RUNNING:
             date_ns = DATE_NS + self.machine.now_ns - self._begin_ns
             due_ns = max(int((date_ns - self.epoch_ns) * self.values['time_scale']), 0)
-            behind_ns = due_ns - loop.now_ns - loop.slipped_ns
+            behind_ns = due_ns - self.simulation.now_ns - loop.slipped_ns
             is_free = (plan.is_calm or is_quiet) and not self.was_full
             assert behind_ns >= -3 and (behind_ns <= 3 or not is_free), 'what is due is sent'
 
@@ -303,12 +303,12 @@ class World:
         self._tick_until(max(machine.now_ns, self._cost_until_ns, self._stops_at_ns) + QUIET_NS)
         self._tick()
         self._check_time(is_quiet=True)
-        before_ns, had_room = self.simulation.now_ns, self.recording.has_room()
+        before_ns, had_room = self.simulation.sent_ns, self.recording.has_room()
         self._tick_until(machine.now_ns + QUIET_NS)
         # Simulated time may be held before the stamp of t = 0.
         if not self.plan.follows and loop.state is LoopState.RUNNING and had_room and (
                 self.recording.has_room()) and before_ns > 0:
-            late_ns = QUIET_NS * self.values['time_scale'] - (loop.now_ns - before_ns)
+            late_ns = QUIET_NS * self.values['time_scale'] - (self.simulation.now_ns - before_ns)
             assert abs(late_ns) <= 2 * loop.tick_period_ns * self.values['time_scale'], (
                 'time goes on')
 

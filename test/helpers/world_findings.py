@@ -55,7 +55,7 @@ def simulated(world):
         assert run.apply(event.kind, **event.details).as_mapping() == event.as_mapping()
         assert event.sent_ns >= 0 or not event.begins_motion, 't = 0 is sent before'
         motion += event.kind == 'reset'
-    play(world.simulation.now_ns)
+    play(world.simulation.sent_ns)
     return sent
 
 
@@ -90,7 +90,7 @@ def check_readers(world, sent):
 def check_counters(world):
     loop, outputs = world.loop, world.simulation.outputs
     assert not world.disk.is_misused, 'a file is closed while it is being synced'
-    assert world.simulation.now_ns <= (round(world.values['duration'] * SECOND) or math.inf)
+    assert world.simulation.sent_ns <= (round(world.values['duration'] * SECOND) or math.inf)
     if world.plan.is_calm and not world.was_full:
         assert (loop.late_ticks, loop.skipped_ticks, loop.slipped_ns) == (0, 0, 0)
         assert not any(one.skipped or one.failed for one in outputs), 'nothing was late'
@@ -131,9 +131,9 @@ def check_handed(world, log, sent):
     expected = {topic: [message[1:] for message in between(sent[topic], begins, ends)]
                 for topic in log.names[:-2]}
     assert {topic: handed[topic] for topic in expected} == expected
-    happened = [Event('start', max(begins.now_ns, 0), begins.now_ns),
+    happened = [Event('start', max(begins.sent_ns, 0), begins.sent_ns),
                 *world.events[begins.events:ends.events]]
-    if ends.now_ns < 0 and len(handed[of_events]) < len(happened) and (
+    if ends.sent_ns < 0 and len(handed[of_events]) < len(happened) and (
             happened[-1].kind == 'reset'):
         happened.pop()      # stamps have gone back, which ended the log
     for topic, name in ((of_commands, COMMANDS), (of_events, EVENTS)):
