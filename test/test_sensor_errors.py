@@ -45,6 +45,32 @@ def test_readings_are_the_truth_with_the_errors_and_the_noise_that_is_left_is_wh
         assert np.abs(noise_left.mean(axis=0) / deviation).max() < 4.5 / math.sqrt(count)
 
 
+SENSORS = ('imu.gyroscope_', 'imu.accelerometer_', 'mag.')
+NO_ERROR = (0.0, 3 * (0.0,), 9 * (0.0,), parameters.IDENTITY)
+
+
+@pytest.mark.parametrize('name', [
+    one.name for one in parameters.TABLE
+    if one.name.startswith(SENSORS) and one.kind is float and one.default in NO_ERROR])
+def test_each_error_alone_is_in_the_readings_of_its_sensor(name):
+    """So `is_perfect` knows of all."""
+    none = parameters.BY_NAME[name].default
+    value = tuple(one + 1e-7 for one in none) if isinstance(none, tuple) else 1e-7
+    _, found = run({**scene_parameters('looping'), name: value}, 50 * MILLISECOND, 'imu/data_raw',
+                   'ground_truth/imu', 'imu/mag', 'ground_truth/mag')
+    (*_, rates, force), (*_, true_rates, true_force), (*_, field, _), (*_, true, _) = (
+        found.values())
+    assert [not np.array_equal(*pair) for pair in (
+        (rates, true_rates), (force, true_force), (field, true))] == [
+            name.startswith(sensor) for sensor in SENSORS]
+
+
+def test_of_the_sensor_only_the_rate_changes_between_resets():
+    """`Imu.at_period` keeps all other values."""
+    assert {name for name in parameters.AT_ONCE if name.startswith('imu.')} == {
+        'imu.enabled', 'imu.rate'}
+
+
 def read(values, times_ns, exact=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
     """Return what an IMU with a sample at each of these times reads, and its bias, (n, 6) each."""
     imu, shape = Imu(parameters.checked(values), times_ns.step), (3, len(times_ns))

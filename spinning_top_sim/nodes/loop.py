@@ -166,7 +166,7 @@ class Loop:
 
         Raises ValueError for what cannot be, and RuntimeError in WAITING and FAILED.
         """
-        if self._simulation.sent_ns < 0:         # the change sends the samples of t = 0
+        if self._simulation.sent_ns < 0:        # the change sends the samples of t = 0
             self._update_subscribers()
         self._advance()
         self._check_motion()

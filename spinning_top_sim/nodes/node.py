@@ -42,7 +42,7 @@ class Simulator(Node):
     The node.
 
     given : parameters of its command line, which those of ROS override
-    values_next : parameters at the next reset or recording; an unset spin.lz follows initial.theta
+    values_next : what the next reset begins with; an unset spin.lz follows initial.theta
 
     Raises ValueError for a parameter that is not allowed.
     """

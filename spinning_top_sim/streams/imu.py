@@ -96,12 +96,9 @@ class Imu:
         self._vibrations = [Vibration(
             values, name, self.low_pass.response if self.low_pass else np.ones_like)
             for name in ('rate', 'force')]
+        self.vibrates = not all(one.is_off for one in self._vibrations)
         interval_ns = period_ns + since_ns - first_begin_ns
         self.memory_ns = max(interval_ns, self.low_pass.memory_ns if self.low_pass else 0)
-
-    @property
-    def vibrates(self) -> bool:
-        return not all(one.is_off for one in self._vibrations)
 
     def vibrating(self, true: tuple[Vector, Vector], t_ns: Times,
                   seconds: Column | float) -> tuple[Vector, Vector]:

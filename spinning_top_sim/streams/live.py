@@ -129,7 +129,7 @@ class LiveSimulation(Simulation):
         self.refresh()
 
     def apply(self, kind: str, **details: Any) -> Event:
-        if self.sent_ns < 0 and kind in MOTIONS:     # the sample of t = 0 comes before them
+        if self.sent_ns < 0 and kind in MOTIONS:    # the sample of t = 0 comes before them
             self.send(0)
         event = super().apply(kind, **details)
         for output, channel in zip(self.outputs, self.channels, strict=True):
@@ -142,8 +142,7 @@ class LiveSimulation(Simulation):
     def refresh(self) -> None:
         """Compute anew what waits: the motion, or who takes the messages, has changed."""
         # Those that are used, with their numbers.
-        self._used = [(number, output) for number, output in enumerate(self.outputs)
-                      if output.is_used]
+        self._used = [one for one in enumerate(self.outputs) if one[1].is_used]
         outputs_of: dict[tuple[int, int], dict[Channel, Output]] = {}
         for _, output in self._used:
             output.take(NEVER_NS)

@@ -59,8 +59,7 @@ class Simulation:
         imu = Imu(values, period_ns(values['imu.rate']))
         self.channels = all_channels(values, imu)
         self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
-        self.values_at_start = dict(values)
-        self.values_in_effect = dict(values)
+        self.values_at_start, self.values_in_effect = dict(values), dict(values)
         self.history: list[Event] = []
         self.sent_ns = -1
         # The trace of the markers and late fixes reach back across events.
@@ -121,7 +120,7 @@ class Simulation:
                              f'{parameters.FASTEST:g} m/s')
         if self.trajectory.pivot is None and not any(target):
             return None
-        timeout = self.values_at_start['pivot.cmd_timeout']      # 0: for ever
+        timeout = self.values_at_start['pivot.cmd_timeout']     # 0: for ever
         stop_ns = self.now_ns + round(timeout * NANOSECONDS) if timeout else NEVER_NS
         return {'x': x, 'y': y, 'z': z, 'stop_ns': stop_ns}
 

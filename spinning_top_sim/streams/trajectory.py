@@ -64,8 +64,7 @@ class Trajectory:
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._forgotten[1] + sum(
-            piece.motion.evaluations for piece in self._pieces)
+        return self._forgotten[1] + sum(piece.motion.evaluations for piece in self._pieces)
 
     def evaluate(self, t_ns: Times) -> States:
         """
