@@ -67,7 +67,8 @@ REFUSED_COMMANDS = {
     (1e300, 1e300): '1e+300', (1e20, 1.0): '1e+20', (-1e150, 1e15): '1e+150'}
 REFUSED_PARAMETERS = [
     ({'spin__l3': math.nan}, 'nan'), ({'spin__l3': 1e20, 'spin__lz': 1.0}, '1e+20'),
-    ({'spin__l3': 'fast'}, 'fast'), ({'pose__enabled': 1}, '1'), ({'top__lambda3': -2}, '-2'),
+    ({'spin__lz': None}, 'cannot be unset'), ({'spin__l3': 'fast'}, 'fast'),
+    ({'pose__enabled': 1}, '1'), ({'top__lambda3': -2}, '-2'),
     ({'top__mass': 1e300, 'top__gravity': 1e300}, '1e+300'), ({'imu__rate': 1e5}, '1000'),
     ({'imu__lever_arm': [0.0, 1.5]}, 'imu.lever_arm = [0.0, 1.5]: must be'),
     ({'record__streams': ['pose', 'poise']}, 'poise'), ({'solver__rtol': '3.5'}, '3.5'),
