@@ -74,6 +74,7 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': Tr
         ('status_period', TINY), ('pose.rate', 1e5), ('imu.gyroscope_M', (*8 * (0.0,), HUGE)),
         ('imu.bias_instability_band', (0.0, 1.0)), ('step.count', 0), ('seed', 10 ** 400),
         ('record.min_free_bytes', 2 ** 63), ('pivot.waypoints', (1.0, math.nan, 0.0)),
+        ('pivot.waypoints', (0.0, 0.0, 0.0, 1.0)),
         ('imu.bandwidth_order', 3))),
     ({'imu.bandwidth': 0.5}, 'imu.bandwidth.*must be a number 0 or >= 1 and <= 100000'),
     ({'imu.vibration.rate_psd': (20.0, 0.1, 20.0, 0.1)}, 'rate_psd.*two or more ascending'),

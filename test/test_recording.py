@@ -11,6 +11,7 @@ import os
 import random
 import re
 import runpy
+import struct
 import subprocess
 import sys
 import time
@@ -24,7 +25,8 @@ from helpers.recordings import EPOCH_NS, JAZZY, METADATA, TOPICS, some_messages
 from helpers.reference import ROOT
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel
+from mcap.records import Channel, Chunk, MessageIndex
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording import provenance
@@ -44,12 +46,30 @@ def record(path, messages, **options):
     return recorder
 
 
+def check_indexes(path):
+    """Each entry of an index is the place of its message in the chunk, as rosbag2 reads it."""
+    plain, count = b'', 0
+    with path.open('rb') as file:
+        for one in StreamReader(file, emit_chunks=True).records:
+            if isinstance(one, Chunk):
+                stream, _ = get_chunk_data_stream(one)
+                plain = stream.read(one.uncompressed_size)
+            elif isinstance(one, MessageIndex):
+                for log_time, offset in one.records:
+                    opcode, _, channel, _, found, _ = struct.unpack_from('<BQHIQQ', plain, offset)
+                    assert (opcode, channel, found) == (
+                        Opcode.MESSAGE, one.channel_id, log_time)
+                    count += 1
+    return count
+
+
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
 def test_mcap_and_rosbags_read_every_message(tmp_path, compression):
     messages, path = some_messages(12_000), tmp_path / 'run.mcap'
     record(path, messages, compression=compression)
     expected = [(TOPICS[index].name, stamp, data) for index, stamp, data in messages]
     assert seen_by_mcap(path) == expected       # with all checksums
+    assert check_indexes(path) == len(messages)
     indexes = [record for record in records_of(path.read_bytes())
                if record[0] == Opcode.MESSAGE_INDEX]
     with path.open('rb') as file:
