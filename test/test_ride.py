@@ -25,6 +25,7 @@ from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import precision
+from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.trajectory import Trajectory
 
 S = 10 ** 9
@@ -128,6 +129,14 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
         one, other = (of.states(np.arange(0, 20 * S, S // 3)).quaternion for of in (
             piece, Piece(TOP, start, 0, method='exact')))
         assert np.minimum(abs(one - other), abs(one + other)).max() <= EXACT
+
+
+def test_steps_beside_a_pole_begin_with_all_that_is_handed_over():
+    """A sleeping top: in doubles, Lz is L3, and the state rests."""
+    posture, times_ns = Posture(1.0 + 0j, 5e-9 + 0j, 1e-7j, 1.6), range(0, 2 * S, S // 10)
+    exact, steps = (np.array(Piece(TOP, posture, 0, method=method).states(times_ns).rows_axis[:2])
+                    for method in ('exact', 'rk45'))
+    assert abs(exact).max() < 5e-8 and abs(steps - exact).max() <= 1e-9 * abs(exact).max()
 
 
 def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():

@@ -175,14 +175,19 @@ class ExactStates(States):
         part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
         square = tangent * tangent
-        self._cos = 1.0 - square
+        cosines = 1.0 - square
         square += 1.0
-        self._cos /= square
+        cosines /= square
         tangent += tangent
-        self._sin = np.divide(tangent, square, out=tangent)
+        sines = np.divide(tangent, square, out=tangent)
+        # Of r t + c + kappa y of alpha and beta, (2, n) each
+        signs = SIGNS.take(self._whole[1:] & 1)
+        cosines[1:] *= signs
+        sines[1:] *= signs
+        self._rotations = cosines[1:], sines[1:]
         # R and s J of alpha and beta, (2, n) each
         quarters = self._whole[0]
-        sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else self._sin[0]
+        sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else sines[0]
         xi = -sin * sin if arrays.stretch else sin * sin
         cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
@@ -195,7 +200,7 @@ class ExactStates(States):
         for k, (one, other) in enumerate(arrays.prefactors):
             rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
-        self._sin_cos, self._cos_y, self._sin_y = bases[3], cos, sin
+        self._cos_y, self._sin_y = cos, sin
 
     @cached_property
     def moduli(self) -> Matrix:
@@ -205,12 +210,6 @@ class ExactStates(States):
         for k in self._arrays.on_line:
             moduli[k] = self._real[k]
         return moduli
-
-    @cached_property
-    def _rotations(self) -> tuple[Matrix, Matrix]:
-        """Cosines and sines of r t + c + kappa y of alpha and beta, (2, n)."""
-        sign = SIGNS.take(self._whole[1:] & 1)
-        return sign * self._cos[1:], sign * self._sin[1:]
 
     @cached_property
     def _alpha_beta(self) -> tuple[Matrix, Matrix]:
@@ -256,7 +255,8 @@ class ExactStates(States):
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
         if not arrays.u_dot.any():      # it rests, perhaps at a pole
             return np.zeros(len(xi))
-        size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
+        size, without = alpha * alpha + beta * beta, [alpha, beta]
+        prefactor = self._sin_y * self._cos_y
         for k, parity in arrays.zeros.items():    # there sin y is divided out
             here = self._parity == parity
             prefactor = np.where(here, self._cos_y, prefactor)
