@@ -94,13 +94,12 @@ class PivotPath:
                 raise ValueError(f'a repeated path has {len(self._starts)} pieces in '
                                  f'{self._cycle_ns / NANOSECONDS!r} s: must last at least '
                                  f'{SHORTEST_S:g} s for each')
-            self._per_cycle[0] = _doubles([_sum((1, places.pop()), (-1, places[0]))]).T
+            self._per_cycle[0] = _doubles([_sum((1, places.pop()), (-1, places[0]))])
             velocities.pop()
         else:
             self._accelerations.append(ZERO)
-        # (n, 3, 3, 1): of each ride the `Kinematics` at its start
-        self._at_starts = np.stack([*map(
-            _doubles, (places, velocities, self._accelerations))], axis=1)[..., np.newaxis]
+        # Of each ride the `Kinematics` at its start
+        self._at_starts = np.stack([*map(_doubles, (places, velocities, self._accelerations))], 1)
 
     @classmethod
     def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
@@ -218,4 +217,5 @@ def _fractions(given: Given) -> Fractions:
 
 
 def _doubles(vectors: Sequence[Fractions]) -> NDArray[np.float64]:
-    return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3)
+    """Return vectors as columns, (n, 3, 1)."""
+    return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3, 1)

@@ -168,25 +168,25 @@ class ExactStates(States):
         super().__init__(top, start, len(t))
         self.t = t / per_second
         self._arrays = arrays
-        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t)
+        self._turned, self._turned_rest, whole, part = arrays.phases(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
         part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
         square = tangent * tangent
-        cosines = 1.0 - square
+        cosines = 1.0 - square[1:]
         square += 1.0
-        cosines /= square
+        cosines /= square[1:]
         tangent += tangent
         sines = np.divide(tangent, square, out=tangent)
         # Of r t + c + kappa y of alpha and beta, (2, n) each
-        signs = SIGNS.take(self._whole[1:] & 1)
-        cosines[1:] *= signs
+        signs = SIGNS.take(whole[1:] & 1)
+        cosines *= signs
         sines[1:] *= signs
-        self._rotations = cosines[1:], sines[1:]
+        self._rotations = cosines, sines[1:]
         # R and s J of alpha and beta, (2, n) each
-        quarters = self._whole[0]
+        self._quarters = quarters = whole[0].copy()
         sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else sines[0]
         xi = -sin * sin if arrays.stretch else sin * sin
         cos = np.sqrt(1.0 - xi)
@@ -235,7 +235,7 @@ class ExactStates(States):
         half = np.arctan2(self.moduli[1], self.moduli[0])
         if arrays.sense:        # by less than half a turn it differs from this
             turned = arrays.start_half + arrays.sense * QUARTER * (
-                self._whole[0] - arrays.start_wholes[0])
+                self._quarters - arrays.start_wholes[0])
             half += math.tau * np.rint((turned - half) / math.tau)
         return (math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
                 + ((arguments[0] + arguments[1]) + arrays.phi_phase),

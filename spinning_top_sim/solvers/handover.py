@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import integrals, pivot
@@ -21,13 +20,11 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.solve import motion_of
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
-from spinning_top_sim.times import NANOSECONDS, ns_array
+from spinning_top_sim.times import NANOSECONDS, Times, ns_array
 
 # Stamps of ROS end at 2^31 s, and doubles hold phases up to 2^52.  The fastest one is that of the
 # nutation in quarter periods: next to hanging it may nutate at twice the rate of its bound.
 FASTEST_RATE = 0.5 * math.pi * 2.0 ** 52 / 2.0 ** 31    # [rad/s]
-
-Times = NDArray[np.int64] | range
 
 
 class Piece:
@@ -88,7 +85,7 @@ class Piece:
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
 
-    def states(self, t_ns: Times) -> States:
+    def states(self, t_ns: Times | range) -> States:
         """
         Return the states in the world, the pivot included, at ascending times from the start on.
 

@@ -3,14 +3,12 @@
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.vertical import Posture, Vertical
+from spinning_top_sim.times import Times
 
 
 class Motion(ABC):
@@ -28,7 +26,7 @@ class Motion(ABC):
         self.top, self.start = top, start
 
     @abstractmethod
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+    def states(self, times_ns: Times | range) -> States:
         """Return the states at ascending times (n,) [ns]."""
 
     @abstractmethod
