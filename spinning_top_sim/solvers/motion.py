@@ -16,7 +16,7 @@ class Motion(ABC):
     The motion of `top` that is in the state `start` at t = 0.
 
     is_exact : whether it is the closed form
-    steps, evaluations : taken so far, of the right-hand side
+    steps, evaluations : integration steps so far, and evaluations of the right-hand side
     """
 
     is_exact = False
@@ -41,5 +41,9 @@ class Motion(ABC):
         return None
 
     def precise_posture(self, t_ns: int, vertical: Vertical | None) -> Posture | None:
-        """Return the posture in the world, if it is known better than by `states`, or None."""
+        """
+        Return the posture in the world in multiprecision, None if that is not known.
+
+        vertical : that of the motion, None if it is the world's
+        """
         return None
