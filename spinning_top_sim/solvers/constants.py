@@ -109,7 +109,7 @@ def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -
 
 
 class _Side(NamedTuple):
-    """Alpha or beta at the start; x is 1 + u for alpha and 1 - u for beta."""
+    """Alpha or beta at the start; momentum is Lz + L3 or Lz - L3, and x 1 + u or 1 - u."""
 
     momentum: mpfr          # its argument has the rate (spin + momentum/(lambda1 x))/2
     spin: mpfr

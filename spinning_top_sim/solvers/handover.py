@@ -56,7 +56,7 @@ class Piece:
                 posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
                            else start.in_doubles())
                 self.motion, self._vertical = self._solution(posture, method, settings)
-                top, begin = self.motion.top, self.motion.start
+                top, begin = self.motion.top, self.motion.start     # in effective gravity
                 self.l3, self.lz, transverse = begin.l3, begin.lz, abs(posture.transverse)
                 self.energy = 0.5 * (
                     top.lambda1 * transverse * transverse + self.l3 / top.lambda3 * self.l3
