@@ -10,6 +10,7 @@ import json
 import math
 from decimal import Decimal
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from helpers.tops import EXACT
 from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
+from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import precision
+from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.trajectory import Trajectory
 
 S = 10 ** 9
@@ -33,7 +36,7 @@ TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80
 
 def kinematics(path, times_ns):
     """Return position, velocity and acceleration (n, 3) of a pivot at times [ns]."""
-    found = [pivot.kinematics(path.piece(int(t)), np.array([t])) for t in times_ns]
+    found = [pivot.kinematics(path.ride(int(t)), np.array([t])) for t in times_ns]
     return Kinematics(*(np.hstack(rows).T for rows in zip(*found, strict=True)))
 
 
@@ -73,10 +76,11 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     # In the longest one an error grows by some 1e10: the true motion is chaotic.
     assert worst_error(run, case) <= EXACT
     end, found = case['times_ns'][-1], []
-    alpha, beta, across, l3 = run.after(end).posture(end)
+    alpha, beta, transverse, l3 = run.after(end).posture(end)
     with precision():
         last = {key: [*map(mpfr, values)] for key, values in case['states'][-1].items()}
-        parts = (alpha.real, -beta.imag, beta.real, alpha.imag, across.real, across.imag)
+        parts = (alpha.real, -beta.imag, beta.real, alpha.imag, transverse.real,
+                 transverse.imag)
         for value, true in zip(parts, (*last['q'], *last['omega'][:2]), strict=True):
             found.append(min(abs(value - true), abs(value + true)) / max(1, abs(true)))
     assert l3 == case['start']['l3']
@@ -93,7 +97,8 @@ def test_steps_on_a_moving_pivot_are_the_motion(name):
 def ride(acceleration):
     """Return a piece of a path of the pivot that begins at rest in the origin and never ends."""
     return pivot.REST._replace(acceleration=tuple(map(Fraction, acceleration)),
-                               begins=np.array((*6 * (0.0,), *acceleration)))
+                               at_start=Kinematics(*np.reshape((*6 * (0.0,), *acceleration),
+                                                               (3, 3, 1))))
 
 
 @pytest.mark.parametrize('acceleration', [
@@ -126,6 +131,14 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
         assert np.minimum(abs(one - other), abs(one + other)).max() <= EXACT
 
 
+def test_steps_beside_a_pole_begin_with_all_that_is_handed_over():
+    """A sleeping top: in doubles, Lz is L3, and the state rests."""
+    posture, times_ns = Posture(1.0 + 0j, 5e-9 + 0j, 1e-7j, 1.6), range(0, 2 * S, S // 10)
+    exact, steps = (np.array(Piece(TOP, posture, 0, method=method).states(times_ns).rows_axis[:2])
+                    for method in ('exact', 'rk45'))
+    assert abs(exact).max() < 5e-8 and abs(steps - exact).max() <= 1e-9 * abs(exact).max()
+
+
 def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
     piece = Piece(TOP, State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5), 5 * S,
                   equations='euler')
@@ -141,6 +154,27 @@ def test_the_exact_twin_of_a_piece_has_its_ride():
     piece, longer = (Piece(TOP, State(theta=0.5, l3=1.6, lz=1.3), 0, ride((0.5, 0, 0))),
                      ride((0.5, 0, 0))._replace(end_ns=9 * S))
     assert piece.exact.ride is piece.ride and piece.with_ride(longer).exact.ride is longer
+
+
+def test_joined_states_have_the_columns_of_their_parts():
+    """All of them, though the parts have starts, verticals and solvers of their own."""
+    parts = [Piece(TOP, State(theta=0.5, theta_dot=0.3, l3=l3, lz=1.3), 0, where,
+                   method=method).states(range(0, S, S // 3))
+             for l3, where, method in ((1.6, pivot.REST, 'exact'), (1.1, pivot.REST, 'rk45'),
+                                       (0.7, ride((1.0, 2.0, 0.5)), 'exact'))]
+
+    def rows(of, name):
+        value = getattr(of, name)
+        return [np.broadcast_to(row, (*np.shape(row)[:-1], len(of)))
+                for row in (value if isinstance(value, tuple) else [value.T])]
+
+    whole, columns = joined(parts), [
+        name for name, of in vars(States).items()
+        if isinstance(of, property | cached_property)]
+    assert 'psi_dot' in columns
+    for name in columns:
+        assert np.array_equal(rows(whole, name), np.concatenate(
+            [rows(part, name) for part in parts], axis=-1)), name
 
 
 def test_the_velocity_of_a_point_is_that_of_its_position():
@@ -161,11 +195,11 @@ TRIANGLE = [(0.1, 0.2, 0.3), (1.7, 0.3, -0.4), (0.6, 2.1, 0.9)]
 @pytest.mark.parametrize('waypoints', [SQUARE, TRIANGLE, TRIANGLE[:2]])
 def test_a_repeated_path_closes(waypoints):
     path = PivotPath.through(waypoints, speed=0.7, acceleration=1.3, repeat=True)
-    piece, ends = path.piece(0), []
+    now, ends = path.ride(0), []
     while len(ends) < len(waypoints):
-        piece = path.piece(piece.end_ns)
-        if not kinematics(path, [piece.start_ns]).velocity.any():
-            ends.append(piece.start_ns)
+        now = path.ride(now.end_ns)
+        if not kinematics(path, [now.start_ns]).velocity.any():
+            ends.append(now.start_ns)
     cycle = ends[-1]
     for times in (0, cycle // 3, ends[0], cycle - 1):
         once, late = (kinematics(path, [t]) for t in (times, times + 10 ** 15 // cycle * cycle))

@@ -14,12 +14,15 @@ import pytest
 from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.physics.pivot import PivotPath
 from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.solve import motion_of
+from spinning_top_sim.solvers.motion import Motion
+from spinning_top_sim.solvers.solve import METHODS, motion_of
 from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.trajectory import Trajectory
 
 SECOND = 1_000_000_000
 TOP = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
@@ -129,6 +132,29 @@ def test_steps_are_read_until_they_are_forgotten(monkeypatch):
     assert short.states_at_seconds(np.array([59.0])).phi[0] == before.phi[59]
     with pytest.raises(IntegrationError, match='oldest'):
         short.states(range(1))
+
+
+def test_a_solver_is_a_name_in_a_table(monkeypatch):
+    """Here one that has nothing but states, and no digits beyond doubles."""
+    class Another(Motion):
+        def states(self, times_ns):
+            read.append(len(times_ns))
+            return ExactSolution(self.top, self.start).states(times_ns)
+
+        def states_at_seconds(self, t):
+            return self.states(np.rint(t * SECOND).astype(np.int64))
+
+    read = []
+    monkeypatch.setitem(METHODS, 'another', lambda top, start, *_: Another(top, start))
+    solve(*LOOPING, [0.0, 1.0], method='another')
+    assert read == [2]
+    runs = [Trajectory(*LOOPING, PivotPath([(SECOND, (1.0, 0.0, 0.0))]), {'method': method},
+                       most_acceleration=2.0) for method in ('another', 'exact')]
+    for run in runs:
+        run.forget(0, 0)
+    found, expected = (run.evaluate(SECOND * np.arange(4)).theta for run in runs)
+    assert found == pytest.approx(expected, abs=1e-12) and read[1:] == [1, 2, 2]
+    assert runs[0].after(0).describe() == runs[1].after(0).describe() is None
 
 
 def test_an_error_that_is_no_number_is_no_small_error(monkeypatch):

@@ -108,18 +108,18 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
     derivatives = np.concatenate([
         attitude.product(rotation, (0.5 * w1, 0.5 * w2, 0.5 * w3, 0.0 * w3)),
         attitude.rotated_back((-x, -y, -z, w), (f1, f2, f3)), (w1, w2, w3), (f1, f2, f3)])
-    # Rotation less the identity, velocity, angles and forces: 4, 3, 3 and 3 rows.
-    sums = np.zeros((13, len(times_ns)))
+    sums = np.zeros((len(derivatives), len(times_ns)))
+    found = Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
     for node, (_, weight) in enumerate(rule):
         sums += weight * derivatives[:, node]
-    sums[3] += 1.0              # w of the identity
+    found.rotation[3] += 1.0            # w of the identity
     if angle >= LEAST_ANGLE:
         seconds = 1e-9 * length_ns
         fall = now.pivot.acceleration[:, :1] * seconds
         fall[2] += now.top.gravity * seconds
-        sums[:7] = _differences(quaternions[:, [0, -1]], rows_of(now.velocity(point))[:, [0, -1]],
-                                fall)
-    return Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
+        found.rotation[:], found.velocity[:] = _differences(
+            quaternions[:, [0, -1]], rows_of(now.velocity(point))[:, [0, -1]], fall)
+    return found
 
 
 def joined(parts: Sequence[Increments]) -> Increments:
@@ -128,9 +128,10 @@ def joined(parts: Sequence[Increments]) -> Increments:
         np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
 
 
-def _differences(quaternions: Matrix, velocities: Matrix, fall: Matrix) -> Matrix:
+def _differences(quaternions: Matrix, velocities: Matrix,
+                 fall: Matrix) -> tuple[Quaternion, Vector]:
     """
-    Return rotation and velocity (7, n) of `Increments` from the states at both ends.
+    Return rotation and velocity of `Increments` from the states at both ends.
 
     The latter is R(a)^T (v(b) - v(a) + fall), with velocities v relative to the pivot.
 
@@ -149,8 +150,9 @@ def _differences(quaternions: Matrix, velocities: Matrix, fall: Matrix) -> Matri
             (now, last), velocities.swapaxes(0, 1), strict=True))
     x, y, z = fall
     change = u1 - v1 + x, u2 - v2 + y, u3 - v3 + z
-    return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
-                     *attitude.rotated_back(now, change)))
+    x, y, z = (scale * part for part in axis)
+    return ((x, y, z, 1.0 + (shrunk + 0.5 * (too_long - longer))),
+            attitude.rotated_back(now, change))
 
 
 def _excess(q: Quaternion) -> Column:

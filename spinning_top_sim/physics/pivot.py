@@ -36,21 +36,24 @@ class Kinematics(NamedTuple):
     acceleration: NDArray[np.float64]
 
 
+AT_REST = Kinematics(*np.zeros((3, 3, 1)))
+
+
 class Ride(NamedTuple):
     """What a pivot does while its acceleration is constant."""
 
     start_ns: int
     end_ns: int                         # the first time after it; NEVER_NS if it never ends
     acceleration: Fractions             # in the world [m/s^2]
-    begins: NDArray[np.float64]         # (9,) position, velocity and acceleration at the start
+    at_start: Kinematics
 
 
-REST = Ride(0, NEVER_NS, ZERO, np.zeros(9))
+REST = Ride(0, NEVER_NS, ZERO, AT_REST)
 
 
 def kinematics(ride: Ride, times_ns: NDArray[np.int64]) -> Kinematics:
     """Return what the pivot does at times (n,) [ns] of this ride."""
-    start, velocity, acceleration = ride.begins.reshape(3, 3, 1)
+    start, velocity, acceleration = ride.at_start
     t = (times_ns - ride.start_ns) * 1e-9
     return Kinematics((0.5 * t * acceleration + velocity) * t + start,
                       velocity + t * acceleration, np.repeat(acceleration, len(t), axis=1))
@@ -80,7 +83,7 @@ class PivotPath:
             velocities.append(_sum((1, v), (t, acceleration)))
             self._starts.append(self._starts[-1] + duration_ns)
             self._accelerations.append(acceleration)
-        self._cycle_ns, self._per_cycle = 0, np.zeros(9)
+        self._cycle_ns, self._per_cycle = 0, np.zeros((3, 3, 1))
         if repeat and any(any(one) for one in self._accelerations):
             change = _sum((1, velocities[-1]), (-1, velocities[0]))
             if _length(change) > ROUNDING * max(map(_length, velocities)):
@@ -91,11 +94,12 @@ class PivotPath:
                 raise ValueError(f'a repeated path has {len(self._starts)} pieces in '
                                  f'{self._cycle_ns / NANOSECONDS!r} s: must last at least '
                                  f'{SHORTEST_S:g} s for each')
-            self._per_cycle[:3] = _doubles([_sum((1, places.pop()), (-1, places[0]))])
+            self._per_cycle[0] = _doubles([_sum((1, places.pop()), (-1, places[0]))])
             velocities.pop()
         else:
             self._accelerations.append(ZERO)
-        self._begins = np.hstack([*map(_doubles, (places, velocities, self._accelerations))])
+        # Of each ride the `Kinematics` at its start
+        self._at_starts = np.stack([*map(_doubles, (places, velocities, self._accelerations))], 1)
 
     @classmethod
     def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
@@ -143,8 +147,8 @@ class PivotPath:
             pieces += _ramp(goal, ZERO, most_acceleration)
         return cls(pieces, position=position, velocity=velocity, start_ns=start_ns)
 
-    def piece(self, t_ns: int) -> Ride:
-        """Return the piece that a time [ns] from the start on belongs to."""
+    def ride(self, t_ns: int) -> Ride:
+        """Return the ride that a time [ns] from the start on belongs to."""
         since_ns = t_ns - self.start_ns
         cycle, phase = divmod(since_ns, self._cycle_ns) if self._cycle_ns else (0, since_ns)
         k = bisect_right(self._starts, phase) - 1
@@ -155,15 +159,15 @@ class PivotPath:
         end = (self._starts[k + 1] if k + 1 < len(self._starts)
                else self._cycle_ns or NEVER_NS - offset)
         return Ride(offset + self._starts[k], offset + end, self._accelerations[k],
-                     self._begins[k] + cycle * self._per_cycle)
+                    Kinematics(*(self._at_starts[k] + cycle * self._per_cycle)))
 
     def lasting(self, t_ns: int) -> Ride:
-        """Return the piece from a time [ns] on with those that have the same acceleration."""
-        piece = self.piece(t_ns)
-        while piece.end_ns < NEVER_NS and (
-                after := self.piece(piece.end_ns)).acceleration == piece.acceleration:
-            piece = piece._replace(end_ns=after.end_ns)
-        return piece
+        """Return the ride from a time [ns] on with those that have the same acceleration."""
+        ride = self.ride(t_ns)
+        while ride.end_ns < NEVER_NS and (
+                after := self.ride(ride.end_ns)).acceleration == ride.acceleration:
+            ride = ride._replace(end_ns=after.end_ns)
+        return ride
 
 
 def _ramp(begin: Fractions, end: Fractions,
@@ -213,4 +217,5 @@ def _fractions(given: Given) -> Fractions:
 
 
 def _doubles(vectors: Sequence[Fractions]) -> NDArray[np.float64]:
-    return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3)
+    """Return vectors as columns, (n, 3, 1)."""
+    return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3, 1)

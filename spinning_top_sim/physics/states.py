@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.pivot import Kinematics, Ride, kinematics
+from spinning_top_sim.physics.pivot import AT_REST, Kinematics, Ride, kinematics
 from spinning_top_sim.physics.top import State, Top
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from spinning_top_sim.table import FilePath
 
 Point = tuple[float, float, float]
-AT_REST = Kinematics(*np.zeros((3, 3, 1)))
 _LARGEST = np.finfo(float).max
 
 
@@ -62,9 +61,10 @@ class States:
     angular_velocity, angular_acceleration : (n, 3) array
         In the body frame [rad/s], [rad/s^2].
     energy : (n,) array
-        Kinetic energy + P cos(theta) [J].
+        Kinetic energy + P cos(theta) [J], about the vertical of `start`.
     l3, lz : (n,) array
-        Angular momentum along the axis and along the vertical [kg m^2/s].
+        Angular momentum along the axis and along the vertical of `start` [kg m^2/s].  What follows
+        from L3 is computed from its constant; steps let l3 drift from that by some rounding.
     pivot : Kinematics
         Position, velocity and acceleration of the pivot in the world.
     norm_error : (n,) array
@@ -78,7 +78,7 @@ class States:
 
     def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
-        self._l3: Column | float = start.l3
+        self._constant_l3: Any = start.l3       # (n,) where it is measured
 
     def __len__(self) -> int:
         return self._n
@@ -121,7 +121,7 @@ class States:
 
     @cached_property
     def l3(self) -> Column:
-        return np.full(len(self), self._l3)
+        return np.full(len(self), self._constant_l3)
 
     @cached_property
     def lz(self) -> Column:
@@ -142,14 +142,14 @@ class States:
     @cached_property
     def phi_dot(self) -> Column:
         """Eq. (31) of "Analysis of Symmetric Spinning Top"."""
-        return attitude.precession_rate(self.top, self.start.l3, self.start.lz,
+        return attitude.precession_rate(self.top, self._constant_l3, self.start.lz,
                                         *self.half_angle_squares)
 
     @cached_property
     def psi_dot(self) -> Column:
         """Eq. (32)."""
         cos2, sin2 = self.half_angle_squares
-        return self._l3 / self.top.lambda3 - self.phi_dot * (cos2 - sin2)
+        return self.rows_angular_velocity[2] - self.phi_dot * (cos2 - sin2)
 
     @cached_property
     def theta_folded(self) -> Column:
@@ -175,7 +175,7 @@ class States:
 
     @cached_property
     def rows_angular_velocity(self) -> Vector:
-        return (*self.transverse_velocity, self._l3 / self.top.lambda3)
+        return (*self.transverse_velocity, self._constant_l3 / self.top.lambda3)
 
     @cached_property
     def angular_velocity(self) -> NDArray[np.float64]:
@@ -201,10 +201,10 @@ class States:
 
     @cached_property
     def energy(self) -> Column:
-        top, (w1, w2) = self.top, self.transverse_velocity
+        top, (w1, w2, w3) = self.top, self.rows_angular_velocity
         # In this order only what is too large itself overflows, not the square of a rate.
         kinetic: Column = 0.5 * (top.lambda1 * w1 * w1 + top.lambda1 * w2 * w2
-                                 + self._l3 / top.lambda3 * self._l3)
+                                 + w3 * self._constant_l3)
         return kinetic + top.mass * self._support[2] * top.com_distance
 
     def position(self, point: Point) -> Vector:
@@ -290,8 +290,8 @@ class WorldStates(States):
     States about another vertical, seen from the world.
 
     Attitude and Euler angles are those in the world: theta in [0, pi], phi and psi in
-    [-2 pi, 2 pi].  Energy, Lz and `start` are those in the frame of the pivot about the vertical
-    there; energy and Lz are constants of the motion.
+    [-2 pi, 2 pi].  `start`, and with it energy and Lz, which are constants, stays that about the
+    other vertical, in the frame of the pivot.
 
     moved : states in the frame of the vertical
     rotation : q(world <- frame)
@@ -353,12 +353,16 @@ def joined(parts: Sequence[States]) -> States:
 
 
 class _Joined(States):
-    """Every column is that of the parts, so no value depends on what it is joined with."""
+    """
+    Every column is that of the parts, so no value depends on what it is joined with.
+
+    Joined is what a subclass of `States` may have of its own, and what needs the start of a part.
+    Each other column follows from these time by time, as in a part.
+    """
 
     def __init__(self, parts: Sequence[States]) -> None:
         super().__init__(parts[0].top, parts[0].start, sum(map(len, parts)))
         self._parts, self.method = parts, parts[0].method
-        self._l3 = np.concatenate([np.broadcast_to(one._l3, (len(one),)) for one in parts])
 
     def _column(self, name: str) -> Any:
         return np.concatenate([getattr(one, name) for one in self._parts])
@@ -366,21 +370,18 @@ class _Joined(States):
     def _rows(self, name: str) -> Any:
         """Return a tuple of columns, of which some parts may have one number for all times."""
         return tuple(np.concatenate([
-            np.broadcast_to(np.asarray(row), (len(one),))
-            for one, row in zip(self._parts, rows, strict=True)])
+            np.broadcast_to(row, (*np.shape(row)[:-1], len(one)))
+            for one, row in zip(self._parts, rows, strict=True)], axis=-1)
             for rows in zip(*(getattr(one, name) for one in self._parts), strict=True))
 
     t, theta_dot, phi_dot, l3, lz, energy = (
         cached_property(methodcaller('_column', name)) for name in (
             't', 'theta_dot', 'phi_dot', 'l3', 'lz', 'energy'))
-    angles, rows_quaternion, transverse_velocity, half_angle_squares, _support = (
+    angles, rows_quaternion, transverse_velocity, rows_angular_velocity, _support = (
         cached_property(methodcaller('_rows', name)) for name in (
-            'angles', 'rows_quaternion', 'transverse_velocity', 'half_angle_squares',
+            'angles', 'rows_quaternion', 'transverse_velocity', 'rows_angular_velocity',
             '_support'))
 
     @cached_property
     def pivot(self) -> Kinematics:
-        return Kinematics(*(np.concatenate([
-            np.broadcast_to(rows, (3, len(one)))
-            for one, rows in zip(self._parts, parts, strict=True)], axis=1)
-            for parts in zip(*(one.pivot for one in self._parts), strict=True)))
+        return Kinematics(*self._rows('pivot'))

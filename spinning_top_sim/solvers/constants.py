@@ -8,18 +8,17 @@ it, with r+- for r - s pi w/(2K).  DLMF: https://dlmf.nist.gov, ch. 19, 20 and 2
 
 The last four lines of the symbols are of alpha; beta has its own.
 
-    P, Omega        M g R, L3/lambda3 - L3/lambda1
     u, u1, u2, u3   cos(theta), and the zeros of its cubic: u1 <= u <= u2 <= 1 <= u3
     chi, w          argument of the elliptic functions, and its constant rate
     m, m1           their parameter (u2 - u1)/(u3 - u1), and 1 - m
     K, K'           the quarter periods K(m) and K(m1)
-    Z, N, y         chi/K, the nearest integer, and (pi/2) (Z - N)
+    N, y            the integer nearest to chi/K, and (pi/2) (chi/K - N)
     s               the sign of Lz + L3; beta: of Lz - L3
     a               the place of its zero; beta: b
     X, R, J, D      numerator R + i s J and denominator of its quotient of theta functions
     r, c, kappa     its phase is r t + c + kappa y besides that of X; r is a mean rate
 
-    u = u1 + (u2 - u1) sn^2(chi),  w^2 = P (u3 - u1)/(2 lambda1)    [DLMF 22.13(i)]
+    u = u1 + (u2 - u1) sn^2(chi),  w^2 = M g R (u3 - u1)/(2 lambda1)    [DLMF 22.13(i)]
     alpha = X(y)/D(y) exp i(r t + c + kappa y),  beta likewise
 
 D is theta4(y) at even N (u near u1) and theta3(y) at odd N (u near u2).  X is i s theta1(y - isa)
@@ -110,7 +109,7 @@ def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -
 
 
 class _Side(NamedTuple):
-    """Alpha or beta at the start; x is 1 + u for alpha and 1 - u for beta."""
+    """Alpha or beta at the start; momentum is Lz + L3 or Lz - L3, and x 1 + u or 1 - u."""
 
     momentum: mpfr          # its argument has the rate (spin + momentum/(lambda1 x))/2
     spin: mpfr
@@ -137,7 +136,7 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
-    # theta -> pi - theta leaves P >= 0, and exchanges alpha and beta.
+    # theta -> pi - theta leaves M g R >= 0, and exchanges alpha and beta.
     mirror = -1 if torque < 0 else 1
     return _nutating(
         sides[::mirror], lambda1, mirror, l3, lz - l3 + 2 * l3 * sin_half ** 2,
@@ -155,12 +154,12 @@ def _resting(side: _Side, lambda1: mpfr) -> Factor:
 
 
 def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
-              momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
+              precession_momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
               ) -> ThetaMotion:
     """
-    Return a motion with P >= 0, or with mirror = -1 that of which this is the mirror image.
+    Return a motion with M g R >= 0, or with mirror = -1 that of which this is the mirror image.
 
-    momentum : Lz - L3 u at the start of the motion itself
+    precession_momentum : Lz - L3 u at the start of the motion itself
     """
     roots, f3 = mp.cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
@@ -188,7 +187,8 @@ def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
         alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(),
         start_whole=start_whole, start_offset=y0 * 2 / const_pi(),
         u_dot=(swing_rate * even, swing_rate * odd), u_dot_series=form.theta1,
-        precession=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
+        precession=(precession_momentum / lambda1 - turn * roots.y1,
+                    precession_momentum / lambda1 - turn * roots.y2),
         swing=(-swing * form.middle4 ** 2,
                swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
         m1=roots.gap32 / roots.gap31, size=form.size)

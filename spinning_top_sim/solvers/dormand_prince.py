@@ -11,7 +11,7 @@ that of a step, where the usual 4th-order continuous extension would spoil the s
 
 import functools
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # The unknowns of one state: complex numbers, of which floats are some.
@@ -120,7 +121,7 @@ def components(vectors: Sequence[float] | Sequence[Unknowns]) -> UnknownRows:
     return np.ascontiguousarray(columns.view(np.float64).T)
 
 
-class SteppedMotion(ABC):
+class SteppedMotion(Motion):
     """
     A motion from its start at t = 0, by steps of equations y' = f(y).
 
@@ -135,7 +136,7 @@ class SteppedMotion(ABC):
 
     def __init__(self, top: Top, start: State, y: Unknowns, tolerance: float,
                  fastest_rate: float) -> None:
-        self.top, self.start = top, start
+        super().__init__(top, start)
         derivative = self.derivative(*y)
         # The steps that can still be read, in order; the first one has no length.
         self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
@@ -194,7 +195,6 @@ class SteppedMotion(ABC):
         return ns if ns / NANOSECONDS <= end else ns - 1
 
     def forget(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time [ns] need."""
         self._forget(self._number(before_ns / NANOSECONDS))
 
     def _forget(self, count: int) -> None:

@@ -16,6 +16,7 @@ from spinning_top_sim.solvers.dormand_prince import (
     UnknownRows,
     Unknowns,
 )
+from spinning_top_sim.solvers.vertical import Posture
 
 # lambda3/lambda1 at which the rounding of psi' + phi' cos(theta) costs eq. (29) a millionth.
 LARGEST_RATIO = 1e-6 * 2.0 ** 53
@@ -33,7 +34,7 @@ class EulerMotion(SteppedMotion):
     lambda3/lambda1 loses digits.
     """
 
-    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+    def __init__(self, top: Top, start: State, _: Posture, rtol: float, atol: float) -> None:
         if top.lambda3 > LARGEST_RATIO * top.lambda1:
             raise ValueError(
                 f'lambda3 = {top.lambda3!r} kg m^2: must be at most {LARGEST_RATIO:.2g} lambda1 '

@@ -168,21 +168,26 @@ class ExactStates(States):
         super().__init__(top, start, len(t))
         self.t = t / per_second
         self._arrays = arrays
-        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t)
+        self._turned, self._turned_rest, whole, part = arrays.phases(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
         part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
         square = tangent * tangent
-        self._cos = 1.0 - square
+        cosines = 1.0 - square[1:]
         square += 1.0
-        self._cos /= square
+        cosines /= square[1:]
         tangent += tangent
-        self._sin = np.divide(tangent, square, out=tangent)
+        sines = np.divide(tangent, square, out=tangent)
+        # Of r t + c + kappa y of alpha and beta, (2, n) each
+        signs = SIGNS.take(whole[1:] & 1)
+        cosines *= signs
+        sines[1:] *= signs
+        self._rotations = cosines, sines[1:]
         # R and s J of alpha and beta, (2, n) each
-        quarters = self._whole[0]
-        sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else self._sin[0]
+        self._quarters = quarters = whole[0].copy()
+        sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else sines[0]
         xi = -sin * sin if arrays.stretch else sin * sin
         cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
@@ -195,7 +200,7 @@ class ExactStates(States):
         for k, (one, other) in enumerate(arrays.prefactors):
             rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
-        self._sin_cos, self._cos_y, self._sin_y = bases[3], cos, sin
+        self._cos_y, self._sin_y = cos, sin
 
     @cached_property
     def moduli(self) -> Matrix:
@@ -205,12 +210,6 @@ class ExactStates(States):
         for k in self._arrays.on_line:
             moduli[k] = self._real[k]
         return moduli
-
-    @cached_property
-    def _rotations(self) -> tuple[Matrix, Matrix]:
-        """Cosines and sines of r t + c + kappa y of alpha and beta, (2, n)."""
-        sign = SIGNS.take(self._whole[1:] & 1)
-        return sign * self._cos[1:], sign * self._sin[1:]
 
     @cached_property
     def _alpha_beta(self) -> tuple[Matrix, Matrix]:
@@ -236,7 +235,7 @@ class ExactStates(States):
         half = np.arctan2(self.moduli[1], self.moduli[0])
         if arrays.sense:        # by less than half a turn it differs from this
             turned = arrays.start_half + arrays.sense * QUARTER * (
-                self._whole[0] - arrays.start_wholes[0])
+                self._quarters - arrays.start_wholes[0])
             half += math.tau * np.rint((turned - half) / math.tau)
         return (math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
                 + ((arguments[0] + arguments[1]) + arrays.phi_phase),
@@ -256,7 +255,8 @@ class ExactStates(States):
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
         if not arrays.u_dot.any():      # it rests, perhaps at a pole
             return np.zeros(len(xi))
-        size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
+        size, without = alpha * alpha + beta * beta, [alpha, beta]
+        prefactor = self._sin_y * self._cos_y
         for k, parity in arrays.zeros.items():    # there sin y is divided out
             here = self._parity == parity
             prefactor = np.where(here, self._cos_y, prefactor)

@@ -27,6 +27,7 @@ from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
+from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
 from spinning_top_sim.times import NANOSECONDS, ns_array
@@ -37,7 +38,7 @@ MOST_TURNS = 2.0 ** 52
 TIMES_TOGETHER = 8192
 
 
-class ExactSolution:
+class ExactSolution(Motion):
     """
     The motion of `top` that is in the state `start` at t = 0, in closed form.
 
@@ -56,14 +57,8 @@ class ExactSolution:
 
     Attributes
     ----------
-    nutation_period : float or None
-        Period of theta [s], None if it is constant.
-    mean_precession_rate, mean_spin_rate : float
-        Means over a nutation [rad/s].
-    theta_min, theta_max : float
-        Bounds of theta folded into [0, pi] [rad].
-    m1 : float
-        1 - m, m the parameter of the elliptic functions: 0 on the separatrix.
+    nutation_period, mean_precession_rate, mean_spin_rate, theta_min, theta_max : float
+        As in `Description`, but those of a nutation however small.
     time_limit : float
         The farthest time either way [s]: there a phase has made 2^52 turns.
 
@@ -73,16 +68,16 @@ class ExactSolution:
         For motions whose constants doubles cannot hold, and from every evaluation for bad times.
     """
 
-    steps = evaluations = 0
+    is_exact = True
 
     def __init__(self, top: Top, start: State | PreciseState,
                  gravity: mpfr | None = None) -> None:
         # A motion about another vertical has its start and its `gravity` in multiprecision.
-        self.top, self._given = top, start
-        self.start = start = start if isinstance(start, State) else start.rounded()
+        super().__init__(top, start if isinstance(start, State) else start.rounded())
+        self._given = start
         with precision():
             self._motion = motion = set_up(top, self._given, gravity)
-            alpha, beta, self.m1 = motion.alpha, motion.beta, float(motion.m1)
+            alpha, beta = motion.alpha, motion.beta
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)
@@ -90,7 +85,7 @@ class ExactSolution:
             self.time_limit = MOST_TURNS / max(
                 abs(float(motion.quarter_rate)), 1e-290,
                 (abs(self.mean_precession_rate) + abs(self.mean_spin_rate)) / (4.0 * math.pi))
-            self.arrays = ThetaArrays(motion, start)
+            self.arrays = ThetaArrays(motion, self.start)
         self.theta_min, self.theta_max = self.arrays.bounds
 
     def describe(self, coincide: float = COINCIDE) -> Description:
@@ -112,7 +107,7 @@ class ExactSolution:
             nutation_period=None if rests else self.nutation_period,
             theta_min=low, theta_max=high, mean_precession_rate=self.mean_precession_rate,
             precession_min=slowest, precession_max=fastest, mean_spin_rate=self.mean_spin_rate,
-            separatrix_distance=self.m1,
+            separatrix_distance=float(self._motion.m1),
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
@@ -133,13 +128,11 @@ class ExactSolution:
                                    t[k:k + TIMES_TOGETHER])
                        for k in range(0, len(t) or 1, TIMES_TOGETHER)])
 
-    def posture(self, t_ns: int, vertical: Vertical | None = None) -> Posture:
+    def precise_posture(self, t_ns: int, vertical: Vertical | None) -> Posture:
         """
-        Return attitude and angular velocity at a time [ns], in multiprecision.
+        Return attitude and angular velocity in the world in multiprecision.
 
         They are right to 38 digits, times what the motion makes of such an error.
-
-        vertical : that of the motion, if it is not the world's
         """
         with precision():
             start = precise(self._given)

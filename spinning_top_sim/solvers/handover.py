@@ -7,29 +7,24 @@ import math
 from contextlib import suppress
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import integrals, pivot
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.solve import motion_of
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
-from spinning_top_sim.times import NANOSECONDS, ns_array
-
-if TYPE_CHECKING:
-    from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.times import NANOSECONDS, Times, ns_array
 
 # Stamps of ROS end at 2^31 s, and doubles hold phases up to 2^52.  The fastest one is that of the
 # nutation in quarter periods: next to hanging it may nutate at twice the rate of its bound.
 FASTEST_RATE = 0.5 * math.pi * 2.0 ** 52 / 2.0 ** 31    # [rad/s]
-
-Times = NDArray[np.int64] | range
 
 
 class Piece:
@@ -60,21 +55,23 @@ class Piece:
             with np.errstate(over='ignore', invalid='ignore'):
                 posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
                            else start.in_doubles())
-                self.motion, self._vertical = self._begun(posture, method, settings)
-                about, begun, across = self.motion.top, self.motion.start, abs(posture.transverse)
-                self.l3, self.lz = begun.l3, begun.lz
-                self.energy = 0.5 * (top.lambda1 * across * across + begun.l3 / top.lambda3
-                                     * begun.l3) + about.gravity_torque * math.cos(begun.theta)
-                self.fastest_rate = integrals.fastest_rate(about, self.l3, self.energy)
+                self.motion, self._vertical = self._solution(posture, method, settings)
+                top, begin = self.motion.top, self.motion.start     # in effective gravity
+                self.l3, self.lz, transverse = begin.l3, begin.lz, abs(posture.transverse)
+                self.energy = 0.5 * (
+                    top.lambda1 * transverse * transverse + self.l3 / top.lambda3 * self.l3
+                    ) + top.gravity_torque * math.cos(begin.theta)
+                self.fastest_rate = integrals.fastest_rate(top, self.l3, self.energy)
             if not self.fastest_rate <= FASTEST_RATE:
                 raise ValueError(f'it turns at up to {self.fastest_rate:.3g} rad/s: must be at '
                                  f'most {FASTEST_RATE:.2g}')
         except (ArithmeticError, IntegrationError, ValueError) as error:
             whence = start if isinstance(start, State) else f't = {start_ns / NANOSECONDS!r} s on'
-            raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
+            raise ValueError(f'no motion from {whence}, for {self.top}: {error}') from error
 
-    def _begun(self, posture: Posture, method: str, settings: Any,
-               ) -> tuple[ExactSolution | SteppedMotion, Vertical | None]:
+    def _solution(self, posture: Posture, method: str, settings: Any,
+                  ) -> tuple[Motion, Vertical | None]:
+        """Return the motion, and the vertical that it is about if that is not the world's."""
         top, start = self.top, self._start
         if self.rests and isinstance(start, State):
             return motion_of(top, start, method=method, **settings), None
@@ -88,7 +85,7 @@ class Piece:
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
 
-    def states(self, t_ns: Times) -> States:
+    def states(self, t_ns: Times | range) -> States:
         """
         Return the states in the world, the pivot included, at ascending times from the start on.
 
@@ -106,7 +103,7 @@ class Piece:
     @cached_property
     def exact(self) -> Piece | None:
         """The same piece by the closed form; None where doubles cannot hold that."""
-        if not isinstance(self.motion, SteppedMotion):
+        if self.motion.is_exact:
             return self
         with suppress(ImportError, ValueError):
             return Piece(self.top, self._start, self.start_ns, self.ride, method='exact')
@@ -114,23 +111,21 @@ class Piece:
 
     def describe(self) -> Description | None:
         """Return the motion in numbers; None if it has no closed form or the pivot moves."""
-        exact = self.exact if self.rests else None
-        return None if exact is None or isinstance(exact.motion, SteppedMotion) else (
-            exact.motion.describe())
+        return self.exact.motion.describe() if self.rests and self.exact else None
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time, for what follows."""
-        if isinstance(self.motion, SteppedMotion):
-            states = self.states(np.array([t_ns]))
-            x, y, z, w, o1, o2 = (float(part[0]) for part in (
-                *states.rows_quaternion, *states.transverse_velocity))
-            return Posture(complex(w, z), complex(y, -x), complex(o1, o2), states.start.l3)
-        return self.motion.posture(t_ns - self.start_ns, self._vertical)
+        precise = self.motion.precise_posture(t_ns - self.start_ns, self._vertical)
+        if precise is not None:
+            return precise
+        states = self.states(np.array([t_ns]))
+        x, y, z, w, w1, w2 = (float(part[0]) for part in (
+            *states.rows_quaternion, *states.transverse_velocity))
+        return Posture(complex(w, z), complex(y, -x), complex(w1, w2), self.l3)
 
     def forget(self, before_ns: int) -> None:
         """Forget the steps that only earlier times need."""
-        if isinstance(self.motion, SteppedMotion):
-            self.motion.forget(before_ns - self.start_ns)
+        self.motion.forget(before_ns - self.start_ns)
 
     def with_ride(self, ride: pivot.Ride) -> Self:
         """Return this motion where the pivot has the same acceleration till another end."""

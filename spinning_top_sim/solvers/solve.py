@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,23 +15,35 @@ from spinning_top_sim.installation import needed
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
-from spinning_top_sim.solvers.dormand_prince import SteppedMotion
 from spinning_top_sim.solvers.euler import EulerMotion
+from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.solvers.vertical import Posture, PreciseState
 
-if TYPE_CHECKING:
-    from spinning_top_sim.solvers.exact import ExactSolution
-
-METHODS = ('rk45', 'exact')
-EQUATIONS = ('transport', 'euler')
 # Doubles do not hold the squares of larger rates [rad/s]; those of the spin are smaller anyway.
 FASTEST_RATE = 1e100
+# They make a motion of the top, the start, its posture, rtol and atol.
+EQUATIONS: Mapping[str, Callable[..., Motion]] = {
+    'transport': TransportMotion, 'euler': EulerMotion}
+
+
+def _closed_form(top: Top, start: State, *_: Any) -> Motion:
+    with needed("method = 'exact'"):
+        from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
+    return ExactSolution(top, start)
+
+
+def _steps(top: Top, start: State, equations: str, *others: Any) -> Motion:
+    return EQUATIONS[equations](top, start, *others)
+
+
+# They make a motion of the top, the start, the name of equations, and what these take.
+METHODS: Mapping[str, Callable[..., Motion]] = {'rk45': _steps, 'exact': _closed_form}
 
 
 def motion_of(top: Top, start: State, *, method: str, equations: str = 'transport',
               rtol: Any = 1e-11, atol: Any = None,
-              posture: Posture | None = None) -> ExactSolution | SteppedMotion:
+              posture: Posture | None = None) -> Motion:
     """
     Return the motion that begins at `start`; `solve` explains the settings.
 
@@ -56,14 +69,11 @@ def motion_of(top: Top, start: State, *, method: str, equations: str = 'transpor
         raise ValueError(f'{top} from {start}: the rate of the axis must be at most '
                          f'{FASTEST_RATE:g} rad/s') from None
     # Rounded to a state beside a pole, a posture that moves a little would rest.
-    if method == 'exact' or (equations == 'transport' and posture is None and (
-            top.gravity_torque == 0.0 or axis_rests(top, start))):
-        with suppress(*(() if method == 'exact' else (ImportError, ValueError))):
-            with needed("method = 'exact'"):
-                from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
-            return ExactSolution(top, start)
-    return (EulerMotion(top, start, rtol, atol) if equations == 'euler'
-            else TransportMotion(top, start, now, rtol, atol))
+    if method == 'rk45' and equations == 'transport' and posture is None and (
+            top.gravity_torque == 0.0 or axis_rests(top, start)):
+        with suppress(ImportError, ValueError):
+            return _closed_form(top, start)
+    return METHODS[method](top, start, equations, now, rtol, atol)
 
 
 def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: float = 1e-11,

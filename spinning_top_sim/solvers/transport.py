@@ -73,9 +73,9 @@ class TransportMotion(SteppedMotion):
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, across, _ = posture
+        alpha, beta, transverse, _ = posture
         # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
-        m = 0.5j * (alpha * alpha * across - beta * beta * across.conjugate()
+        m = 0.5j * (alpha * alpha * transverse - beta * beta * transverse.conjugate()
                     + 2.0 * alpha * beta * (l3 / lambda1))
         self._energy = 2.0 * lambda1 * abs(m) ** 2 + torque * (abs(alpha) ** 2 - abs(beta) ** 2)
         # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
@@ -84,15 +84,16 @@ class TransportMotion(SteppedMotion):
         self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
         self._tolerance = rtol + atol               # the unknowns are scaled to 1
         self._large_enough = NUTATION_SHARE * self._scale ** 2
-        # Their signs are the senses in which the phases and theta turn.
-        self.momenta = lz + l3, lz - l3, 0.0
+        # In which the phases of alpha and beta and theta/2 turn: 1, -1, or 0 for either.
+        self.senses = *map(np.sign, (lz + l3, lz - l3)), 0.0
         half = 0.5 * start.theta
         # Of the moduli, where theta is continued out of [0, pi].
         self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
-        self._starts = 0.5 * start.phi + 0.5 * start.psi, 0.5 * start.phi - 0.5 * start.psi
+        self._phases_at_start = (0.5 * start.phi + 0.5 * start.psi,
+                                 0.5 * start.phi - 0.5 * start.psi)
         # Phases of alpha and beta, less their uniform parts, and theta/2 at the begins of the
         # steps that are kept [rad].
-        self._begins = np.array([*self._starts, half])[:, np.newaxis]
+        self._phases_at_steps = np.array([*self._phases_at_start, half])[:, np.newaxis]
         super().__init__(
             top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
             self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
@@ -169,51 +170,51 @@ class TransportMotion(SteppedMotion):
         """
         moduli, phases = [], []
         for k, part in enumerate((uniform, -uniform)):
-            real, imag, sign, start = y[2 * k], y[2 * k + 1], self._signs[k], self._starts[k]
-            if self.momenta[k]:
+            real, imag, sign = y[2 * k], y[2 * k + 1], self._signs[k]
+            if self.senses[k]:
                 moduli.append(sign * np.hypot(real, imag))
                 phases.append(np.arctan2(sign * imag, sign * real) - part)
             else:       # it moves on a line through zero
+                start = self._phases_at_start[k]
                 moduli.append(real * np.cos(start + part) + imag * np.sin(start + part))
                 phases.append(np.full(len(part), start))
         return [*phases, np.arctan2(moduli[1], moduli[0])]
 
     def _unwrap(self) -> None:
         """Follow the phases to the begins of all steps that are kept."""
-        new = self._kept[self._begins.shape[1]:]
+        new = self._kept[self._phases_at_steps.shape[1]:]
         if new:
             t = np.array([step.t0 for step in new])
             y = tuple(components([step.y0 for step in new]))
             phases = self.phases(y, self.uniform_rates[0] * t)
-            self._begins = np.concatenate((self._begins, [
+            self._phases_at_steps = np.concatenate((self._phases_at_steps, [
                 phase + math.tau * np.cumsum(turns_to_follow(
-                    phase, np.concatenate(([before], phase[:-1])), momentum))
-                for phase, before, momentum in zip(
-                    phases, self._begins[:, -1], self.momenta, strict=True)]), axis=1)
+                    phase, np.concatenate(([before], phase[:-1])), sense))
+                for phase, before, sense in zip(
+                    phases, self._phases_at_steps[:, -1], self.senses, strict=True)]), axis=1)
 
     def _forget(self, count: int) -> None:
         self._unwrap()
         super()._forget(count)
-        self._begins = self._begins[:, count:].copy()
+        self._phases_at_steps = self._phases_at_steps[:, count:].copy()
 
     def _unknowns(self, t: Column) -> UnknownRows:
-        """Return the unknowns, and `_begins` of the step that each time [s] lies in."""
+        """Return the unknowns, and `_phases_at_steps` of the step that each time [s] lies in."""
         self._unwrap()
         steps, unknowns = self._interpolated(t)
-        return np.concatenate((unknowns, self._begins.take(steps, axis=1)))
+        return np.concatenate((unknowns, self._phases_at_steps.take(steps, axis=1)))
 
     def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
         return _TransportStates(self, t, unknowns)
 
 
-def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
+def turns_to_follow(phase: Column, before: Column, sense: float) -> Column:
     """
     Return the whole turns to add to `phase` so that it follows `before` [rad].
 
-    In the sense of `momentum`, but for rounding; without one (momentum 0) it is the nearest.
+    In this sense, but for rounding; without one (0) it is the nearest.
     """
-    ahead = 0.5 * math.pi * ((momentum > 0.0) - (momentum < 0.0))
-    return 0.0 - np.rint((phase - before - ahead) / math.tau)
+    return 0.0 - np.rint((phase - before - 0.5 * math.pi * sense) / math.tau)
 
 
 class _TransportStates(States):
@@ -225,7 +226,7 @@ class _TransportStates(States):
         super().__init__(motion.top, motion.start, len(t))
         self.t, self._motion = t, motion
         self._stepped: Components = tuple(rows[:6])
-        self._begins = rows[6:]
+        self._phases_before = rows[6:]
 
     @cached_property
     def _projected(self) -> Components:
@@ -247,9 +248,9 @@ class _TransportStates(States):
         phases = self._motion.phases(self._projected, uniform)
         # theta/2 turns by less than half a turn within a step.
         half_sum, half_difference, half = (
-            phase + math.tau * turns_to_follow(phase, begin, momentum)
-            for phase, begin, momentum in zip(
-                phases, self._begins, self._motion.momenta, strict=True))
+            phase + math.tau * turns_to_follow(phase, before, sense)
+            for phase, before, sense in zip(
+                phases, self._phases_before, self._motion.senses, strict=True))
         half_sum, half_difference = half_sum + uniform, half_difference - uniform
         return half_sum + half_difference, 2.0 * half, half_sum - half_difference
 

@@ -45,10 +45,10 @@ class SampledStates(States):
         super().__init__(top, State(theta=0.0, l3=0.0, lz=0.0), len(t))
         (x, y, z, w), (w1, w2, w3), self.turns = rows[QUATERNION], rows[RATES], rows[TURNS]
         self.t, self.rows_quaternion, self.transverse_velocity = t, (x, y, z, w), (w1, w2)
-        self._l3 = self.l3 = top.lambda3 * w3
+        self._constant_l3 = self.l3 = top.lambda3 * w3
         up_1, up_2, height = self.rows_vertical
         across = w1 * up_1 + w2 * up_2
-        self.lz = top.lambda1 * across + self._l3 * height
+        self.lz = top.lambda1 * across + self.l3 * height
         with np.errstate(divide='ignore', invalid='ignore'):        # at a pole
             self.phi_dot = across / (up_1 ** 2 + up_2 ** 2)
 

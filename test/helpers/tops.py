@@ -77,7 +77,8 @@ def check_motion(top, start):
     steps = motion_of(top, start, method='rk45', rtol=RTOL, atol=0.1 * RTOL)
     stepped = steps.states_at_seconds(period * INSTANTS)
     assert all(np.all(np.isfinite(getattr(stepped, name))) for name in COLUMNS)
-    if solution.m1 > 1e-3:          # near a separatrix neighbouring motions part
+    # Near a separatrix neighbouring motions part.
+    if solution.describe().separatrix_distance > 1e-3:
         bound = 20.0 * RTOL * (steps.steps + 1)
         sine = np.sin(motion.theta_folded)
         told = sine > 20.0 * bound
