@@ -273,7 +273,7 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
 @pytest.mark.parametrize(('arguments', 'says'), [
     ([], 'log --filter --command --node is required'),
     (['x', '--topic', '/pose', '--filter', 'vqf'], 'not allowed with argument'),
-    (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'),
+    (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'), (['--command', ' '], 'must be a program'),
     (['x', '--topic', '/pose', '--data', '.'], '--data cannot be given with log'),
     (['--node', 'x'], '--node needs --topic'),
     (['--filter', 'vqf', '--data', '.', '--level', 'field'],

@@ -148,11 +148,14 @@ def steps(exam: Exam) -> Measured:
 
 
 def large_turns(exam: Exam) -> Measured:
-    """Compare large turns in one step with the closed form."""
-    off = abs(1.0 - float(np.median(_gains(*exam.answers('large turns', LARGE))[:, 0])))
-    return Measured(off, f'a turn of {LARGE:g} rad in one step, {LARGE * RATE:g} rad/s, is '
-                    f'{off:.2%} off, a small one is not; a step of first order is '
-                    f'{LARGE ** 2 / 12.0:.2%} off', 'gyroscope' if off > EXPLAINED else '')
+    """Compare large turns in one step with small ones: the closed form is the same for both."""
+    large, small = (float(np.median(_gains(*exam.answers(name, size))[:, 0]))
+                    for name, size in (('large turns', LARGE), ('turns', SMALL)))
+    off = abs(1.0 - large / small)
+    return Measured(off, f'a turn of {LARGE:g} rad in one step, {LARGE * RATE:g} rad/s, moves the '
+                    f'attitude by {large:.4g} of it, a small one by {small:.4g}; a step of '
+                    f'first order is {LARGE ** 2 / 12.0:.2%} off',
+                    'gyroscope' if off > EXPLAINED else '')
 
 
 def tilt_answer(exam: Exam) -> Measured:

@@ -21,6 +21,7 @@ The faults and the measures are defined in docs/exam.md.
 
 import argparse
 import runpy
+import shlex
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -115,7 +116,10 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
         with needed('the exam of a node', 'ros'):
             from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
         return partial(examine_node, subject)
-    make_filter: Callable[[], Filter] = partial(Program, subject)
+    words = shlex.split(subject) if kind == 'command' else []
+    if kind == 'command' and not words:
+        raise ValueError(f'--command {subject!r}: must be a program and its arguments')
+    make_filter: Callable[[], Filter] = partial(Program, words)
     how, name = feed, subject
     if kind == 'filter' and subject in FILTERS:
         make_filter = FILTERS[subject]

@@ -5,9 +5,10 @@ import contextlib
 import os
 import re
 import select
-import shlex
+import signal
 import subprocess
 import time
+from collections.abc import Sequence
 from typing import NoReturn
 
 import numpy as np
@@ -30,12 +31,13 @@ class Program:
     three numbers, and with `covariance` and nine.
     """
 
-    def __init__(self, command: str) -> None:
+    def __init__(self, command: Sequence[str]) -> None:
         try:
             self._process = subprocess.Popen(
-                shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
+                start_new_session=True)
         except OSError as error:
-            raise InvalidOutputError(f'cannot start {command}: {error.strerror}') from error
+            raise InvalidOutputError(f'cannot start {command[0]}: {error.strerror}') from error
         assert self._process.stdin and self._process.stdout
         self._to, self._from = self._process.stdin, self._process.stdout
         self._text = b''
@@ -92,8 +94,9 @@ class Program:
                                  f'{abs(code)}')
 
     def close(self) -> None:
-        """End the process."""
-        self._process.kill()
+        """End the process, and what it has started."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._from.close()
         with contextlib.suppress(BrokenPipeError):

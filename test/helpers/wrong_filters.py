@@ -153,6 +153,7 @@ WRONG = {
     'rates y x z': (partial(Part, rates=axes(2, 1, 3)), 'gyroscope'),
     'rates negated': (partial(Part, rates=np.negative), 'gyroscope'),
     'rates x 1.05': (partial(Part, rates=scaled(1.05, 1.0, 1.0)), 'gyroscope'),
+    'rates x 1.015': (partial(Part, Mahony, rates=scaled(*3 * (1.015,))), 'accuracy'),
     'rates in deg': (partial(Part, rates=np.radians), 'gyroscope'),
     'rates clipped': (partial(Part, rates=lambda v: np.clip(v, -8.0, 8.0)), 'gyroscope'),
     'rates late': (partial(Part, late=(5, 0, 0, 0)), 'timing'),
