@@ -30,9 +30,11 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
 
     Parameters
     ----------
+    make_filter : callable
+        As for `examine`.
     folder : path
         With the trials.
-    make_filter, subject, feed, show
+    subject, feed, show : optional
         As for `examine`.
 
     Raises
