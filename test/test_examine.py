@@ -124,7 +124,7 @@ def test_off_the_axis_the_acceleration_is_that_of_the_point():
                      {}, [0])
     exam.lead = 10
     ((part,), run) = exam.motion.of('top'), exam.run
-    assert checks.lever_arm(exam).value == 0.0
+    assert checks.lever_arm(exam).value < 1e-12
     arm = exam.told['lever arm'][0].run
     rows, rates = slice(part.begin + 450, part.end - 50), run.gyroscope
     expected = np.cross(np.gradient(rates, 0.01, axis=0), checks.ARM) + np.cross(

@@ -169,11 +169,11 @@ def test_messages_of_any_length_are_all_kept_and_the_bytes_are_always_the_same(t
     assert contents[0] == contents[1]
     with path.open('rb') as stream:
         reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert 3 <= len(summary.chunk_indexes) <= 9
         for _, channel, message in reader.iter_messages(log_time_order=False):
             assert message.sequence == len(found[channel.id - 1])
             found[channel.id - 1].append((message.log_time, message.data))
-        summary = reader.get_summary()
-        assert 3 <= len(summary.chunk_indexes) <= 9
         assert summary.statistics.message_start_time == 1
         assert summary.statistics.message_end_time == 5000
     assert found == [[message[1:] for message in messages if message[0] == topic]
