@@ -118,7 +118,8 @@ class McapWriter:
                 sorted(self._rows, key=itemgetter(0)), lambda rows: (rows[0], rows[2].shape[1])):
             _, times, parts = zip(*alike, strict=True)
             times_ns, channel = np.concatenate(times), topic + 1
-            record, numbers = np.dtype([*MESSAGE, ('data', 'u1', (size,))]), np.arange(len(times_ns))
+            record = np.dtype([*MESSAGE, ('data', 'u1', (size,))])
+            numbers = np.arange(len(times_ns))
             messages = np.frombuffer(plain, record, len(numbers), offset)
             messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
             messages['channel'], messages['sequence'] = channel, numbers + counts[channel]
