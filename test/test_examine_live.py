@@ -63,6 +63,19 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
             assert np.isnan(outcome.covariances).all()
 
 
+def test_what_a_node_says_is_passed_on_until_it_is_asked_to_end(tmp_path, capfd):
+    path = tmp_path / 'plain.py'
+    path.write_text(PLAIN.replace('rclpy.init()', "print('begin', file=sys.stderr); rclpy.init()"))
+    with live.NodeExam(f'{sys.executable} {path}', 'imu/data') as node:
+        node.start()
+    assert capfd.readouterr().err == 'begin\n'
+    path.write_text("raise SystemExit('it is broken')")
+    with (live.NodeExam(f'{sys.executable} {path}', 'imu/data') as node,
+          pytest.raises(RuntimeError, match='has ended with 1')):
+        node.start()
+    assert capfd.readouterr().err == 'it is broken\n'
+
+
 def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plain, monkeypatch):
     with live.NodeExam(plain(), 'imu/data') as node:
         (outcome,) = feeding.feed(node.start, [run])
@@ -116,7 +129,7 @@ def test_the_node_ends_with_the_exam():
         exam.wait()
 
 
-def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
+def test_a_node_that_does_not_start_or_answer_is_told(run, plain, tmp_path, monkeypatch):
     with (live.NodeExam('/nope', 'imu/data') as node,
           pytest.raises(feeding.NodeError, match='cannot start /nope')):
         node.start()
@@ -125,6 +138,13 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
         monkeypatch.setattr(live, 'PATIENCE_S', 1.0)
         with pytest.raises(RuntimeError, match='answers no sample within 1 s'):
             filter_.update(run.gyroscope[0], run.accelerometer[0], None, 0.01)
+    other = tmp_path / 'other.py'
+    other.write_text(PLAIN.replace('import Imu', 'import Imu, Range').replace(
+        'publisher(Imu', 'publisher(Range'))
+    with (live.NodeExam(f'{sys.executable} {other}', 'imu/data') as node,
+          pytest.raises(feeding.NodeError, match=r'imu/data has the type sensor_msgs/msg/Range: '
+                                                 'must be sensor_msgs/msg/Imu')):
+        node.start()
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
         feeding.feed(node.start, [run])

@@ -86,13 +86,26 @@ def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(
         [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)] for one in newest])
 
 
+def test_tum_takes_the_body_where_the_log_has_no_odometry_of_the_imu(tmp_path, capsys):
+    log, path = log_of(tmp_path / 'run.mcap', '--duration', 0.1), tmp_path / 'a'
+    assert inspect.main([str(log), '--export', f'tum:{path}']) == 0
+    assert capsys.readouterr().out.endswith(f'{path}: tum of the body, from ground_truth/odom\n')
+    with AnyReader([log]) as reader:
+        poses = [reader.deserialize(data, connection.msgtype).pose.pose
+                 for connection, _, data in reader.messages()
+                 if connection.topic == '/ground_truth/odom']
+    assert np.array_equal(np.array(rows(path, ' '), np.float64)[:, 1:], [
+        [*xyz(one.position), *xyz(one.orientation), one.orientation.w] for one in poses])
+
+
 @pytest.mark.parametrize(('kind', 'reason', 'code'), [
-    ('tum:DIR/a', 'the log has no ground_truth/imu_odom', 2),
+    ('euroc:DIR/a', 'no ground_truth/imu_odom; a run has it with ground_truth_', 2),
     ('euroc_imu:DIR/a', 'no imu/data_raw', 2), ('euroc_imu:DIR/there', 'there: File exists', 1)])
 def test_what_cannot_be_exported_is_told(tmp_path, capsys, kind, reason, code):
     (tmp_path / 'there').write_text('precious')
     log = log_of(tmp_path / 'run.mcap', '--duration', 1, '-p', 'imu.enabled:=false')
-    assert inspect.main([str(log), '--export', kind.replace('DIR', str(tmp_path))]) == code
+    assert inspect.main([str(log), '--export', kind.replace('DIR', str(tmp_path)),
+                         '--export', f'tum:{tmp_path / "b"}']) == code
     assert reason in capsys.readouterr().err
-    assert not (tmp_path / 'a').exists()
+    assert not (tmp_path / 'a').exists() and not (tmp_path / 'b').exists()
     assert (tmp_path / 'there').read_text() == 'precious'

@@ -6,9 +6,11 @@ import os
 import shlex
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from threading import Thread
+from typing import IO, Any
 
 import numpy as np
 import rclpy
@@ -29,6 +31,7 @@ from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 from spinning_top_sim.tools.report import Report
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
+IMU_TYPE = 'sensor_msgs/msg/Imu'
 PATIENCE_S = 20.0               # for a node to start, and to answer first
 AGAIN_S = 0.3                   # after it, the first sample is sent again
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
@@ -89,9 +92,13 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Start the node anew; return it as a filter."""
         self._end_process()
         try:
-            self._process = subprocess.Popen(self._command, start_new_session=True)
+            self._process = subprocess.Popen(self._command, start_new_session=True,
+                                             stderr=subprocess.PIPE)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
+        self._reader = Thread(target=self._pass_on, args=[self._process, self._process.stderr],
+                              daemon=True)
+        self._reader.start()
         if not self._wait(lambda: self._imu.get_subscription_count()
                           and self._node.count_publishers(self._topic), PATIENCE_S):
             raise RuntimeError(
@@ -104,9 +111,19 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_AVAILABLE))
         self._now_ns, self._answered = START_NS, 0
         self._check_alone()
+        for one in self._node.get_publishers_info_by_topic(self._topic):
+            if one.topic_type != IMU_TYPE:
+                raise NodeError(f'{self._topic} has the type {one.topic_type}: must be {IMU_TYPE}')
         self._answers.clear()
         self.covariance = None
         return self
+
+    def _pass_on(self, process: object, stderr: IO[bytes]) -> None:
+        """Print what a node says until it is asked to end: a traceback is usual then."""
+        with stderr:
+            for line in stderr:
+                if process is self._process:
+                    print(line.decode(errors='replace'), end='', file=sys.stderr, flush=True)
 
     def _check_alone(self) -> None:
         """Raise NodeError if another node publishes on a topic of the exam."""
@@ -171,6 +188,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             if time.monotonic() > end:
                 return False
             if self._process is not None and self._process.poll() is not None:
+                self._reader.join(AGAIN_S)      # the last words of the node come first
                 raise RuntimeError(f'the node has ended with {self._process.returncode}')
             self._executor.spin_once(timeout_sec=0.05)
         return True

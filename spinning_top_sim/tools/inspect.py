@@ -66,6 +66,8 @@ def _run(arguments: argparse.Namespace) -> int:
         for option, reason in (('verify', foreign or objection(run)), ('export', foreign)):
             if reason and getattr(arguments, option):
                 raise LogError(f'--{option}: {reason}')
+        if run is not None:
+            log_exports.check(run, arguments.export)
         found = Survey(reader, run)
         if run is None:
             found.notes.append(foreign)

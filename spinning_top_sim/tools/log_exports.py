@@ -20,7 +20,8 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import Times, stamp_text
 from spinning_top_sim.tools.recorded_run import RunDescription, channels_of
 
-RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
+RAW, BIAS = 'imu/data_raw', 'ground_truth/imu_bias'
+ODOMETRY, BODY = 'ground_truth/imu_odom', 'ground_truth/odom'
 EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],'
               'q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],'
               'b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],'
@@ -33,8 +34,9 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
     """Add the argument --export."""
     parser.add_argument(
         '--export', type=_parse, metavar='KIND:FILE', action='append', default=[],
-        help='write a file for other tools: tum or euroc, the true trajectory of the IMU; '
-        'euroc_imu, its readings (CSV); may be repeated; an existing file is never overwritten')
+        help='write a file for other tools: tum or euroc, the true trajectory of the IMU '
+        f'(tum: of the body where the log has no {ODOMETRY}); euroc_imu, its readings (CSV); '
+        'may be repeated; an existing file is never overwritten')
 
 
 def _parse(text: str) -> tuple[str, Path]:
@@ -45,21 +47,30 @@ def _parse(text: str) -> tuple[str, Path]:
     return kind, Path(name)
 
 
+def check(run: RunDescription, exports: Sequence[tuple[str, Path]]) -> None:
+    """Raise ValueError if the log lacks a topic that an export needs."""
+    for kind, _ in exports:
+        for topic in KINDS[kind][0]:
+            if topic not in run.topics and (kind != 'tum' or BODY not in run.topics):
+                name = next(channel.name for channel in channels_of(run.values_in_effect)
+                            if channel.topic == topic)
+                raise ValueError(f'--export {kind}: the log has no {topic}; a run has it with '
+                                 f'{name}.enabled:=true, and {name} in record.streams')
+
+
 def write(reader: LogReader, run: RunDescription,
           exports: Sequence[tuple[str, Path]]) -> Iterator[str]:
     """Write the files; yield a line about each.  Raises ValueError or OSError."""
     for kind, path in exports:
-        topics, rows = KINDS[kind]
-        for topic in topics:
-            if topic not in run.topics:
-                raise ValueError(f'--export {kind}: the log has no {topic}')
         with new_file(path) as file:
-            file.writelines(rows(reader, run))
-        yield f'{path}: {kind}'
+            file.writelines(KINDS[kind][1](reader, run))
+        of_body = kind == 'tum' and ODOMETRY not in run.topics
+        yield f'{path}: {kind}{f" of the body, from {BODY}" if of_body else ""}'
 
 
 def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
-    for stamps_ns, (position, orientation, *_) in _blocks(reader, run, ODOMETRY):
+    topic = ODOMETRY if ODOMETRY in run.topics else BODY
+    for stamps_ns, (position, orientation, *_) in _blocks(reader, run, topic):
         yield from _rows(' ', map(stamp_text, stamps_ns), position, orientation)
 
 

@@ -81,6 +81,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
         history = [_event_before(entry) for entry in json.loads(metadata['history'])]
         check_stamp(epoch_ns)
         environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
+        dict(json.loads(environment['libraries']))      # raises if it cannot be one
         topics = _topics(reader.topics, at_recording)
         journal = [topics[name] for name in topics if name == events.EVENTS]
         return RunDescription(

@@ -2,6 +2,7 @@
 """The comparison of a log with the computation of its run, byte by byte."""
 
 import itertools
+import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -66,9 +67,12 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int) -> Comparison:
     end_ns : log time up to which they are compared [ns]
     """
     topics = [topic for name, topic in run.topics.items() if name != events.EVENTS]
+    there, here = ({**json.loads(one['libraries']), **one, 'libraries': ''}
+                   for one in (run.environment, provenance.environment()))
+    # A library that only one of both has was not needed.
     result = Comparison(dict.fromkeys(topics, 0), warnings=[
-        f'{what} was {run.environment[what]}, is {here}'
-        for what, here in provenance.environment().items() if run.environment[what] != here])
+        f'{what} was {there[what]}, is {here[what]}'
+        for what in here if there.get(what, here[what]) != here[what]])
     waiting: _Waiting = defaultdict(lambda: ([], []))
     messages = reader.messages(topics)
     message = next(messages, None)
