@@ -59,6 +59,7 @@ help:
 #:              elevator free_fall shuttle  or the path of a parameter file
 run:
 	$(INSTALL) '$(VENV)/.deps-plot' '$(VENV)/.deps-ros-$(ROS)' '$(VENV)/.package'
+	@test -e 'config/$(SCENE).yaml' -o -e '$(SCENE)' || $(BIN)/spinning-top' node --scene '$(SCENE)'
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. Another terminal of this machine' \
 	    'listens after:'

@@ -10,7 +10,6 @@ The type of the topic is that of its publisher.  Ctrl-C ends it.
 """
 
 import argparse
-import math
 import time
 from collections import deque
 from importlib import import_module
@@ -38,15 +37,19 @@ def numbers(message, within=''):
 
 def wait_for_type(node, topic):
     """Return the class of the messages on a topic, as soon as somebody publishes there."""
-    told = False
+    begin, told = time.monotonic(), 0
     while True:
-        for name, types in node.get_topic_names_and_types():
-            if name == topic and node.count_publishers(topic):
-                package, _, kind = types[0].partition('/msg/')
-                return getattr(import_module(f'{package}.msg'), kind)
+        topics = {name: types for name, types in node.get_topic_names_and_types()
+                  if node.count_publishers(name)}
+        if topic in topics:
+            package, _, kind = topics[topic][0].partition('/msg/')
+            return getattr(import_module(f'{package}.msg'), kind)
         if not told:
             print(f'waiting for a publisher on {topic}', flush=True)
-            told = True
+            told = 1
+        elif told == 1 and time.monotonic() - begin > 3.0:
+            print(f'published are {", ".join(sorted(topics))}', flush=True)
+            told = 2
         rclpy.spin_once(node, timeout_sec=0.2)
 
 
@@ -66,10 +69,10 @@ def main():
         heard += 1
         arrivals.append(time.monotonic())
         since = arrivals[-1] - arrivals[0]
-        rate = (len(arrivals) - 1) / since if since else math.nan
+        rate = f'  {(len(arrivals) - 1) / since:.1f} Hz' if since else ''
         stamp = getattr(getattr(message, 'header', None), 'stamp', None)
         when = f'{stamp.sec}.{stamp.nanosec:09d}  ' if stamp else ''
-        print(f'{when}{"  ".join([*numbers(message)][:MOST_NUMBERS])}  {rate:.1f} Hz', flush=True)
+        print(f'{when}{"  ".join([*numbers(message)][:MOST_NUMBERS])}{rate}', flush=True)
 
     try:
         topic = node.resolve_topic_name(arguments.topic)

@@ -164,7 +164,8 @@ def test_start_and_topics_choose_what_is_played_and_what_is_not_taken_is_counted
                       '100')
     assert raw == [[text(n) for n in range(20, 60, 2)]]
     said = capfd.readouterr()
-    assert 'played 20 messages' in said.out and 'the log has no topic /nobody\n' in said.err
+    assert said.out == f'playing {path}\nplayed 20 messages\n'
+    assert 'the log has no topic /nobody\n' in said.err
     with OwnReplay(path, '--rate', '100') as replay:
         replay.node.outputs[1].publish = None       # it raises, as with a reader that stalls
         replay.spin_until('the end', replay.node.finished.done)

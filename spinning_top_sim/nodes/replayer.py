@@ -145,9 +145,13 @@ class Replayer(Node):
 
     def start(self) -> None:
         """Play when the executor spins."""
+        tell(f'playing {self._log.path}')
 
     def stop(self) -> None:
         self._log.close()
+        tell(f'played {self.sent} messages' + (
+            f'; {self.failed} not published: a reader that keeps all has stalled'
+            if self.failed else ''))
 
     def _step(self) -> None:
         """Send what is due; a timer calls it when something is."""
@@ -175,9 +179,6 @@ class Replayer(Node):
             self._later_ns += self._next_ns - self._begin_ns + ROUND_GAP_NS
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
-        tell(f'played {self.sent} messages' + (
-            f'; {self.failed} not published: a reader that keeps all has stalled'
-            if self.failed else ''))
         self.finished.set_result(0)
 
     def _play_round(self) -> Iterator[float]:

@@ -101,5 +101,5 @@ class NodeStatus:
         return ' | '.join((
             f't {now_ns / NANOSECONDS:9.2f} s {state}', regime.name if regime else '-',
             f'theta {theta:6.2f} deg', f'x{self._measure_speed(now_ns):.2f}',
-            f'{self._total("sent")} messages published',
+            f'{self._total("sent")} messages to subscribers',
             f'L3 {l3:.4g} Lz {lz:.4g}', f'energy drift {self._energy_drift():+.0e}'))

@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> int:
     for line in reader.damage:
         cli.print_line(line)
     is_all = not (reader.lost_bytes or reader.changed)
-    cli.print_line(f'{"kept all" if is_all else "kept"}: {messages} messages, '
+    cli.print_line(f'{"kept all that it has" if is_all else "kept"}: {messages} messages, '
                    f'{output.stat().st_size} bytes in {output}')
     return cli.OK if is_all else SOME_LOST
 
