@@ -4,7 +4,6 @@
 A ROS node with an attitude filter, for the exam of nodes:
 
   spinning-top examine --node "python examples/attitude_node.py" --topic imu/data
-  spinning-top examine --topic imu/data                      # while it runs
 """
 
 import contextlib
