@@ -73,10 +73,39 @@ def test_a_defect_of_the_motion_is_named(name):
         assert report.found[0].number == pytest.approx(NUMBERS[name], rel=1e-3)
 
 
+@pytest.mark.parametrize(('slow', 'rates'), [(0.99, False), (0.999, False), (0.999, True)])
+def test_a_slow_clock_is_no_other_mass(slow, rates):
+    def run(top, start, times, dt):
+        motion = solve(top, start, slow * times)
+        return {'attitudes': motion.quaternion, **(
+            {'rates': motion.angular_velocity} if rates else {})}
+
+    report = grade(run, scenes=SHORT[:2])
+    assert report.faults == ['inaccurate'] and 'from the start on' in str(report), report
+
+
+@pytest.mark.parametrize('size', [1.005, 1.01, 2.0])
+def test_rates_of_another_size_are_named_and_the_gyroscope_is_right(size):
+    report = short(Imu(defect=lambda b: {'rates': size * b.w}))
+    assert report.faults == ['rates_scale'], report
+    assert report.found[0].number == pytest.approx(size)
+
+
+def test_what_is_held_is_named_and_the_rest_is_graded():
+    def run(*given, name):
+        said = Imu(defect='late')(*given)
+        said[name] = said[name][::2].repeat(2, axis=0)[:len(said[name])]
+        return said
+
+    for name, faults in (('gyroscope', {'held', 'late'}), ('attitudes', {'held'})):
+        report = short(lambda *given, name=name: run(*given, name=name))
+        assert {*report.faults} == faults, report
+
+
 def test_with_the_step_of_a_game_the_fast_spin_is_left_out():
     report = grade(Imu(), scenes=SCENES[1:], dt=1.0 / 60.0)
     assert report.passed, report
-    assert 'total_error_deg: waves' in report.marks
+    assert 'total_error_deg: waves' in report.marks and 'not judged: fast spin' in str(report)
     assert 'total_error_deg: fast spin' not in report.marks
 
 

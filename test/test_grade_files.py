@@ -236,6 +236,24 @@ def test_a_log_of_this_package_is_graded_against_its_own_exact_motion(tmp_path, 
         capsys.readouterr().out)
 
 
+@pytest.mark.parametrize(('hz', 'says'), [
+    (200.0, 'lever_arm_z                       0.2'),
+    (4.0, 'not judged: the motion'), (1e3, 'not judged: the motion')])
+def test_the_lever_arm_of_a_scene_that_has_none_is_found_and_few_poses_are_told(
+        tmp_path, capsys, hz, says):
+    t = np.arange(59 if hz > 200.0 else 300) / hz
+    motion = solve(TOP, START, t)
+    w, arm = motion.angular_velocity, (0.1, 0.0, 0.2)
+    force = (Rotation.from_quat(motion.quaternion).inv().apply((0.0, 0.0, TOP.gravity))
+             + np.cross(motion.angular_acceleration, arm) + np.cross(w, np.cross(w, arm)))
+    columns = dict(zip(('t', 'qx', 'qy', 'qz', 'qw', 'ax', 'ay', 'az'), np.column_stack(
+        (t, motion.quaternion, force)).T, strict=True))
+    path = str(table(tmp_path / 'a.csv', columns))
+    assert main([path, '--scene', 'looping']) == 0
+    assert says in capsys.readouterr().out
+    assert main([path, '--scene', 'looping', '--lever-arm', '0.1', '0', '0.1']) == (hz == 200.0)
+
+
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 START = State(theta=0.5235987755982988, l3=1.6, lz=1.3)         # config/looping.yaml
 

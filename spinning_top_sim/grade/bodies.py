@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.causes import OFFSETS, judge
@@ -13,13 +14,13 @@ from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Compariso
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
 from spinning_top_sim.tools.identify import beyond
-from spinning_top_sim.tools.kinematics import Parts, Reals, Stretch, stretches
+from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-EXCERPT_S, FEWEST, MOST = 5.0, 1000, 3000     # of a motion by which a convention is found
+EXCERPT_S, SAMPLES = 5.0, (1000, 3000)        # of a motion by which a convention is found
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
-HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual
+HELD_RUNS, HELD_SHARE = 20, 0.95    # runs of equal readings that are a hold, and as long as usual
 
 
 def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STANDARD_GRAVITY,
@@ -41,17 +42,20 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     """
     imu, parts, faults = imu or Imu(), dict(parts), list[Finding]()
     for name, (times, values) in parts.items():
-        new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
-        if count := held(np.diff(np.flatnonzero(new))):
-            faults.append(Finding('held', f'{name}: each row is told {count:.3g} times: the '
-                                  'sensor, or the log, is slower than its stamps', count))
+        new, hold = held(name, values)
+        if hold:
+            faults.append(hold)
             if name not in READINGS:
-                return Report(subject, faults, {}, ['beside held poses readings are not graded'])
+                return Report(subject, faults, unjudged=['readings, beside held poses'])
             parts[name] = times[new], values[new]
     bodies, left_out = stretches(parts)
     notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] if left_out else []
     if not bodies:
-        return Report(subject, faults, {}, [*notes, 'no part without a gap is long enough'])
+        return Report(subject, faults, {}, notes, unjudged=[
+            'readings: no part without a gap is long enough'])
+    if any(body.coarse for body in bodies):
+        return Report(subject, faults, {}, notes, unjudged=[
+            f'readings: the body turns by more than {MOST:g} rad between two samples'])
     convention = convention_of(bodies, imu, gravity)
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
@@ -61,13 +65,16 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
         judge(name, bodies, imu, gravity, placed='positions' in parts) for name in READINGS))
 
 
-def held(runs: Reals) -> float:
-    """Return how many times each reading is told, by runs of equal ones; 0: there is no hold."""
+def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], Finding | None]:
+    """Return which rows (n, k) are not those before, and the fault if each is told again."""
+    new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
+    runs = np.diff(np.flatnonzero(new))
     if len(runs) < HELD_RUNS or np.mean(runs) < 1.3:
-        return 0.0
-    usual = math.floor(float(np.median(runs)))
+        return new, None
+    usual, count = math.floor(float(np.median(runs))), float(np.mean(runs))
     near = max(np.mean((runs == usual + k) | (runs == usual + k + 1)) for k in (-1, 0))
-    return float(np.mean(runs)) if near >= HELD_SHARE else 0.0
+    return new, Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
+                        'log, is slower than its stamps', count) if near >= HELD_SHARE else None
 
 
 def undone(body: Stretch, convention: Convention) -> Stretch:
@@ -86,7 +93,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
         part.startswith('sensor') for part in one.parts)]
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
-    count = max(FEWEST, min(MOST, round(EXCERPT_S / body.step)))
+    count = int(np.clip(EXCERPT_S / body.step, *SAMPLES))
     first = int(np.argmax(angles[count:] - angles[:-count])) if len(angles) > count else 0
     body = body.part(slice(first, first + count))       # in which it turns the most
 

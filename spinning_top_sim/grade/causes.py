@@ -58,7 +58,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
     """
     compared, faults = Comparison(kind, stretches, imu, gravity), list[Verdict]()
     if not compared.motions:
-        return Report(kind)
+        return Report(kind, unjudged=[f'{kind}: too few samples'] * (
+            any(kind in one.readings for one in stretches)))
     samples, sigma, clear = compared.lag()
     late, sigma = samples * compared.steps, sigma * compared.steps
     if clear and abs(late) > max(LATE, SURE * sigma):
@@ -76,14 +77,13 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         compared.undo(undone.undo)
     faults.extend(found)
     if kind == 'accelerations' and not placed and rest > max(STRANGE, 2.0 * compared.floor):
-        return Report(kind, notes=[f'{kind}: {100.0 * rest:.3g} % of the reading may be the '
-                                   'acceleration of the origin: without positions they are not '
-                                   'graded'])
+        return Report(kind, unjudged=[f'{kind}: {100.0 * rest:.3g} % of the reading may be the '
+                                      'acceleration of the origin, without positions'])
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)), **_marks(compared)}
     if kind in DENSITIES and UNCLEAR.isdisjoint(one.name for one in found):
         faults.extend(_noise_faults(compared, residual, getattr(imu, DENSITIES[kind])))
     return Report(kind, [Finding(one.name, f'{kind}: {one.evidence}', one.number)
-                         for one in faults], marks, [*_untold(compared)])
+                         for one in faults], marks, unjudged=[*_untold(compared)])
 
 
 def _interval(sigma: float) -> str:
@@ -115,7 +115,7 @@ class Causes:
         if unit := [*self._field_unit()]:
             return unit, residual, before
         if before <= self.least:
-            return [], residual, before
+            return [*self._slow(before)], residual, before
         chosen = identify.explain(
             *identify.compressed(compared.target, compared.effects), [*self._causes()],
             math.hypot(compared.floor, 0.5 * self.least), always)
@@ -138,6 +138,15 @@ class Causes:
             return [Verdict('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
                             'the motion', rest)], residual, rest
         return [one for one in told if one and one.name], residual, rest
+
+    def _slow(self, before: float) -> Iterator[Verdict]:
+        """Yield the size of rates, where it alone makes a small discrepancy."""
+        if self.kind != 'rates':
+            return
+        (share, _), _, residual = self.compared.fit(['total', 'step'])
+        if abs(share) > STRANGE and rms(residual) < UNEXPLAINED * before:
+            yield Verdict('rates_scale', f'the readings are {1.0 + share:.4g} times what they '
+                          'should be', 1.0 + share)
 
     def _causes(self) -> Iterator[Cause]:
         if self.kind == 'accelerations':
@@ -309,7 +318,7 @@ def _untold(compared: Comparison) -> Iterator[str]:
     for name, deviation in zip(terms, sigma.tolist(), strict=False):
         if (worse := SURE * deviation / TELLS) > 1.0:
             yield (f'{compared.kind}: the size of the term {name} is known to '
-                   f'+- {196.0 * deviation:.2g} % only: its faults are not told' + (
+                   f'+- {196.0 * deviation:.2g} % only' + (
                        f'; poses with noise of {turns / worse:.2g} rad, {places / worse:.2g} m '
                        'would tell' if compared.noisy and worse < math.inf else ''))
 

@@ -36,7 +36,7 @@ from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.tools import cli, conventions, scene_file
-from spinning_top_sim.tools.kinematics import Smoothed, stretches
+from spinning_top_sim.tools.kinematics import MOST, Smoothed, stretches
 from spinning_top_sim.tools.report import Finding, Mark, Report, printed
 
 START = 0.02            # angle to the start that is given, beyond which there is another [rad]
@@ -86,7 +86,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if of_top and not known:            # the pivot is at rest
         parts = {'positions': (at, np.zeros((len(at), 3))), **parts}
     report = Report(path.name, [], {}, recorded.notes).plus(grade_readings(
-        parts, _imu(arguments, given, values, of_top, recorded.densities),
+        parts, _imu(arguments, given, values, bool(known), recorded.densities),
         gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY))
     if known:
         report = _without_declared(report, known.values_in_effect)
@@ -96,9 +96,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],
-         of_top: bool, densities: Mapping[str, float]) -> Imu:
+         known: bool, densities: Mapping[str, float]) -> Imu:
     """Return what is known of the IMU."""
-    arm, field = (tuple(values[name]) if of_top or name in given else None
+    arm, field = (tuple(values[name]) if known or name in given else None
                   for name in ('imu.lever_arm', 'mag.field'))
     return Imu(
         lever_arm=tuple(arguments.lever_arm) if arguments.lever_arm else arm, field=field,
@@ -122,8 +122,10 @@ def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
 def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) -> Report:
     """Return a report on the motion of a top beside the exact one."""
     bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
-    body = max(bodies, key=lambda one: len(one.t))
-    tolerance, notes = TOLERANCE + NOISES * body.sigma['attitudes'], []
+    body = max(bodies, key=lambda one: len(one.t), default=None)
+    tolerance, notes = TOLERANCE + NOISES * (body.sigma['attitudes'] if body else math.inf), []
+    if not body or body.coarse or tolerance > MOST:
+        return Report('', unjudged=['the motion: too few poses, or too much noise'])
     if run is not None:                 # its own exact motion, its moving pivot included
         first_ns = float(recorded.origin * 10 ** 9 - run.epoch_ns)
         motion = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory

@@ -37,6 +37,7 @@ GAP = 2.5                       # intervals that are a gap
 EVEN = 1e-4                     # share of the interval by which stamps may be uneven
 DEGREE = 5                      # of the splines between samples
 LEAST = 60                      # samples of a stretch
+MOST = 0.7      # that a body turns in a step [rad]: in longer ones rates are not known
 # A sample is left out if the error of its derivative is over OUTLIER times the median error and
 # over ROUGH times the median second derivative; if more than FEW of all would be, none is.
 OUTLIER, ROUGH, FEW = 20.0, 1e-3, 0.1
@@ -117,6 +118,12 @@ class Stretch:
         return replace(self, t=self.t[chosen], rotation=self.rotation[chosen],
                        positions=self.positions[chosen], readings={
                            name: values[chosen] for name, values in self.readings.items()})
+
+    @property
+    def coarse(self) -> bool:
+        """Whether there are too few samples to know the rates."""
+        angles = (self.rotation[:-1].inv() * self.rotation[1:]).magnitude()
+        return float(np.quantile(angles, 1.0 - FEW)) > MOST
 
     @cached_property
     def matrices(self) -> Reals:

@@ -62,11 +62,13 @@ class Report:
     marks : mapping of Mark
         By name.
     notes : sequence of str
-        What was read, and what was not judged, and why.
+        What was read.
     outcomes : sequence
         What the marks are computed from, for figures.
     absolute : bool
         Whether the headings of the outcomes are judged against north, or about their mean.
+    unjudged : sequence of str
+        What was not judged, and why: `passed` says nothing of it.
     """
 
     subject: str
@@ -75,10 +77,11 @@ class Report:
     notes: Sequence[str] = ()
     outcomes: Sequence[Any] = field(default=(), repr=False, compare=False)
     absolute: bool = field(default=True, repr=False, compare=False)
+    unjudged: Sequence[str] = ()
 
     @property
     def passed(self) -> bool:
-        """Whether no fault was found."""
+        """Whether no fault was found, in what was judged."""
         return not self.found
 
     @property
@@ -96,10 +99,13 @@ class Report:
         every = self, *others
         return replace(self, found=[one for report in every for one in report.found],
                        marks={name: one for report in every for name, one in report.marks.items()},
-                       notes=[one for report in every for one in report.notes])
+                       notes=[one for report in every for one in report.notes],
+                       unjudged=[one for report in every for one in report.unjudged])
 
     def __str__(self) -> str:
-        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}',
+        right = 'no fault found in what was judged' if self.unjudged else 'passed'
+        lines = [f'{self.subject}: {", ".join(self.faults) or right}',
+                 *(f'  not judged: {one}' for one in self.unjudged),
                  *(f'  {finding.name}: {finding.evidence}' for finding in self.found),
                  *(f'  {note}' for note in self.notes)]
         return '\n'.join([*lines, *self.mark_lines()])
@@ -138,7 +144,7 @@ class Report:
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
             'found': [*map(told, self.found)],
             'marks': {name: told(mark) for name, mark in self.marks.items()},
-            'notes': list(self.notes)}, indent=2)
+            'notes': list(self.notes), 'unjudged': list(self.unjudged)}, indent=2)
 
 
 def _number(value: float) -> str:
