@@ -37,7 +37,7 @@ from spinning_top_sim.tools.survey import Motion, Survey, Topic
 from spinning_top_sim.tools.verify import Comparison, compare, objection
 
 FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
-MOST_NUTATIONS = 40         # in a plot, that can be told apart
+MOST_NUTATIONS, RESTS = 40, 9       # that a plot tells apart; digits of a tilt that rests
 NUMBERS = [one.name for one in fields(Description) if one.name != 'name']
 
 
@@ -105,13 +105,15 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     if arguments.plot is not None:
         # A motion is of one energy.
         change = [relative_drift(one.energy, one.energy[:1]) for one in found.shown]
-        begins, end = [one.t[0] for one in found.shown], _end_of_plot(found)
-        figure = pictures.plot(joined(found.shown), np.concatenate(change), begins[1:], end)
+        begins, states = [one.t[0] for one in found.shown], joined(found.shown)
+        rises = np.diff(states.theta_folded.round(RESTS)) > 0.0
+        tops = states.t[1:-1][rises[:-1] & ~rises[1:]]
+        end = tops[MOST_NUTATIONS] if len(tops) > MOST_NUTATIONS else states.t[-1]
+        figure = pictures.plot(states, np.concatenate(change), begins[1:], end)
         title = (f'{arguments.log.name}: {sum(one <= end for one in begins)} of '
                  f'{len(found.motions)} motions')
-        if end < np.inf:
-            title += (f', the first {MOST_NUTATIONS} nutations, up to {end:.4g} s of '
-                      f'{found.shown[-1].t[-1]:.4g} s')
+        if end < states.t[-1]:
+            title += f', up to {end:.4g} s of {states.t[-1]:.4g} s'
         missing = [one.measured.missing for one in found.motions if one.measured]
         figure.suptitle('\n'.join((title, *list(filter(None, missing))[:1])))
         with new_file(arguments.plot) as file:
@@ -120,19 +122,6 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
         with new_file(arguments.animate) as file:
             pictures.animate(found.shown[0], FRAMES_PER_S, LONGEST_S).save(
                 file.name, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)  # 4 inches
-
-
-def _end_of_plot(found: Survey) -> float:
-    """Return the time of the last nutation of a plot [s], infinite if all have room."""
-    left = float(MOST_NUTATIONS)
-    for motion, states in zip((one for one in found.motions if one.measured), found.shown,
-                              strict=True):
-        period = next((one.nutation_period for one in (motion.measured, motion.exact)
-                       if one and one.nutation_period), np.inf)
-        if left * period < states.t[-1] - states.t[0]:
-            return float(states.t[0] + left * period)
-        left -= float(states.t[-1] - states.t[0]) / period
-    return np.inf
 
 
 def _as_text(found: Survey) -> Iterator[str]:
