@@ -46,10 +46,10 @@ def motions(path):
 
 
 def page_about_a_log(path):
-    """Draw the page of `inspect --plot` for half a minute of cusps."""
+    """Draw the page of `inspect --plot` for a quarter of a minute of cusps."""
     with tempfile.TemporaryDirectory() as folder:
         log = f'{folder}/cusp.mcap'
-        simulate.main(['-o', log, '--duration', '30', '--quiet',
+        simulate.main(['-o', log, '--duration', '15', '--quiet',
                        '-p', 'imu.gyroscope_noise_density:=0.01',
                        '-p', 'imu.accelerometer_noise_density:=0.05'])
         path.unlink(missing_ok=True)

@@ -23,7 +23,7 @@ FULL_TURN = 2.0 * np.pi
 INK, FAINT, PATH = '#1b1b1b', '#c9c9c9', '#0b6fa4'
 # Okabe and Ito's colours: distinct also for the colour-blind, and as greys.
 COLOURS = ('#0072b2', '#d55e00', '#009e73')
-LEAST_DRIFT = 1e-12         # that an axis shows
+LEAST_CHANGE = 1e-12         # that an axis shows
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
 
 
@@ -77,32 +77,34 @@ def _outline(motion: Any) -> tuple[Reals, list[float]]:
     return path, [float(tilts.min()), float(tilts.max())]
 
 
-def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
+def plot(motion: Any, change: Reals, begins: Sequence[float] = (), end: float = np.inf) -> Figure:
     """
     Return a figure of `States`, or of what has its columns; see `States.plot`.
 
     motion : has t, rows_axis, theta_folded and phi_dot
-    drift : relative one of the energy, (n,)
+    change : relative one of the energy, (n,)
     begins : times at which other motions begin [s]
+    end : time up to which it is drawn [s]
     """
     path, bounds = _outline(motion)
+    shown = slice(max(int(np.searchsorted(motion.t, end, 'right')), 2))
     figure = Figure(figsize=(10.0, 7.0), layout='constrained')
-    panels = figure.subplot_mosaic([['sphere', 'theta'], ['sphere', 'rate'], ['sphere', 'drift']])
+    panels = figure.subplot_mosaic([['sphere', 'theta'], ['sphere', 'rate'], ['sphere', 'change']])
     draw_sphere(panels['sphere'], (*bounds, np.pi / 2))
-    draw_tip(panels['sphere'], path)
+    draw_tip(panels['sphere'], path[shown])
     panels['sphere'].set_title('path of the axis on the unit sphere')
     for name, title, label, values, color in (
             ('theta', 'nutation', 'tilt θ [deg]', np.degrees(motion.theta_folded), COLOURS[0]),
             ('rate', 'precession', "rate φ' [rad/s]", motion.phi_dot, COLOURS[1]),
-            ('drift', 'energy', 'relative drift [1]', drift, COLOURS[2])):
-        panels[name].plot(motion.t, values, color=color)
+            ('change', 'energy', 'relative change [1]', change, COLOURS[2])):
+        panels[name].plot(motion.t[shown], values[shown], color=color)
         panels[name].set(title=title, ylabel=label, xlabel='t [s]')
-        for begin in begins:
+        for begin in (begin for begin in begins if begin <= end):
             panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
     # Of an exact motion it is rounding noise.
-    reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
-                                                where=np.isfinite(drift))))
-    panels['drift'].set_ylim(-reach, reach)
+    reach = max(LEAST_CHANGE, 1.1 * float(np.max(np.abs(change[shown]), initial=0.0,
+                                                 where=np.isfinite(change[shown]))))
+    panels['change'].set_ylim(-reach, reach)
     panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
     return figure
 

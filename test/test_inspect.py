@@ -181,6 +181,23 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
+def test_a_plot_of_many_nutations_is_of_the_first_and_says_so(stepped, tmp_path, capsys,
+                                                              monkeypatch):
+    pytest.importorskip('matplotlib')
+    content, titles = as_json(capsys, stepped)[1], []
+    for most in (40, 4):
+        monkeypatch.setattr(inspect, 'MOST_NUTATIONS', most)
+        assert told(capsys, stepped, '--plot', tmp_path / f'{most}.svg')[0] == 0
+        *_, title = re.findall('<!-- (.*) -->', (tmp_path / f'{most}.svg').read_text())
+        titles.append(title)
+    assert titles[0] == 'stepped.mcap: 3 of 4 motions'
+    end, = re.findall(r'3 of 4 motions, up to (.*) s of 3 s', titles[1])
+    end_ns = content['motions'][0]['begin_ns'] + float(end) * SECOND
+    nutations = sum(max(0.0, min(end_ns, one['end_ns']) - one['begin_ns'])
+                    / one['exact']['nutation_period'] / SECOND for one in content['motions'])
+    assert nutations == pytest.approx(4.5, abs=0.5)
+
+
 def test_samples_that_are_far_apart_are_drawn(tmp_path, capsys, monkeypatch):
     pytest.importorskip('matplotlib')
     pytest.importorskip('PIL.Image')

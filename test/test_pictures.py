@@ -19,7 +19,7 @@ def test_plot_draws_the_columns():
     for label, expected in (
             ('tilt θ [deg]', np.degrees(motion.theta_folded)),
             ("rate φ' [rad/s]", motion.phi_dot),
-            ('relative drift [1]', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
+            ('relative change [1]', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
         line = panels[label].lines[0]
         assert (line.get_xdata() == motion.t).all() and (line.get_ydata() == expected).all()
     path = panels['path of the axis on the unit sphere'].lines[-2]
@@ -28,7 +28,7 @@ def test_plot_draws_the_columns():
     assert np.ravel(pictures.project(np.eye(3)[2:])) == pytest.approx(
         [0.0, 0.5 ** 0.5, 0.5 ** 0.5], abs=1e-15)
     # The rounding noise of an exact motion is no curve.
-    assert panels['relative drift [1]'].get_ylim() == (-1e-12, 1e-12)
+    assert panels['relative change [1]'].get_ylim() == (-1e-12, 1e-12)
 
 
 def test_animate_shows_samples_in_time():

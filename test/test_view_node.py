@@ -42,7 +42,7 @@ def test_a_running_node(desk, peer, tmp_path):
     spinning.start()
     with SimNode(tmp_path, namespace='/seen') as node:
         status = desk.inputs['*waiting for sim_node*']
-        wait_for('/diagnostics, with the stamp of t = 0', lambda: 't = ' in status.content)
+        wait_for('/diagnostics, with the stamp of t = 0', lambda: 'factor' in status.content)
         assert wait_for('a motion', motion) == 'cusps'
         desk.press('time', 'Step')
         assert desk.message.content.startswith('**refused:** step: ')

@@ -275,7 +275,7 @@ class States:
 
     def plot(self) -> Figure:
         """
-        Return a figure of the motion: the path of its axis, tilt, precession rate, energy drift.
+        Return a figure of the motion: the path of its axis, tilt, precession rate, energy.
 
         Raises ValueError for fewer than two times, or times that do not ascend, and ImportError
         without matplotlib.

@@ -37,6 +37,7 @@ from spinning_top_sim.tools.survey import Motion, Survey, Topic
 from spinning_top_sim.tools.verify import Comparison, compare, objection
 
 FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
+MOST_NUTATIONS, RESTS = 40, 9       # that a plot tells apart; digits of a tilt that rests
 NUMBERS = [one.name for one in fields(Description) if one.name != 'name']
 
 
@@ -103,10 +104,18 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
         from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
     if arguments.plot is not None:
         # A motion is of one energy.
-        drift = np.concatenate([relative_drift(one.energy, one.energy[:1]) for one in found.shown])
-        figure = pictures.plot(joined(found.shown), drift, [one.t[0] for one in found.shown[1:]])
-        figure.suptitle(f'{arguments.log.name}: {len(found.shown)} of {len(found.motions)} '
-                        'motions')
+        change = [relative_drift(one.energy, one.energy[:1]) for one in found.shown]
+        begins, states = [one.t[0] for one in found.shown], joined(found.shown)
+        rises = np.diff(states.theta_folded.round(RESTS)) > 0.0
+        tops = states.t[1:-1][rises[:-1] & ~rises[1:]]
+        end = tops[MOST_NUTATIONS] if len(tops) > MOST_NUTATIONS else states.t[-1]
+        figure = pictures.plot(states, np.concatenate(change), begins[1:], end)
+        title = (f'{arguments.log.name}: {sum(one <= end for one in begins)} of '
+                 f'{len(found.motions)} motions')
+        if end < states.t[-1]:
+            title += f', up to {end:.4g} s of {states.t[-1]:.4g} s'
+        missing = [one.measured.missing for one in found.motions if one.measured]
+        figure.suptitle('\n'.join((title, *list(filter(None, missing))[:1])))
         with new_file(arguments.plot) as file:
             figure.savefig(file.name, format=arguments.plot.suffix[1:] or 'png', dpi=120)
     if arguments.animate is not None:

@@ -18,7 +18,6 @@ TRACE, BOUNDS, SPHERE, STAND = (217, 72, 43), (122, 82, 179), (190, 200, 215), (
 FOOT = 0.8                      # length of the stand / that of the axis
 ARROWS = {'angular momentum': (20, 120, 70), 'torque': (20, 150, 180)}
 NO_LINES = np.zeros((1, 2, 3), np.float32)
-TRACE_POINTS = 1500             # samples in the trace at most
 REACH = 1.6                     # radius of the sphere of the trace / distance of the tip
 LONGEST_CHORD = 0.5             # of a step of the trace / its radius; a longer step is a jump
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
@@ -44,7 +43,7 @@ def circle(radius: float, theta: float) -> Lines:
 
 def tip_path(track: Track, t_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a time, from where the pivot is."""
-    _, states = track.states(t_ns - WINDOW_NS, t_ns, TRACE_POINTS)
+    _, states = track.states(t_ns, t_ns - WINDOW_NS, t_ns)
     axis, place = np.stack(states.rows_axis, axis=1), states.pivot.position.T
     joined = np.linalg.norm(np.diff(axis, axis=0), axis=1) < LONGEST_CHORD
     return lines_through(axis_length(track) * axis + (place - place[-1]))[joined]

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.status import EPOCH, SPEED, STATE, TIME
+from spinning_top_sim.nodes.status import EPOCH, SPEED, STATE
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import NODE_NAME
 from spinning_top_sim.times import NANOSECONDS
@@ -127,11 +127,10 @@ class NodeView(Node):
             numbers = {pair.key: pair.value for pair in status.values}
             # Another node may have the name, too.
             if status.name == self._name.lstrip('/') and {
-                    STATE, TIME, SPEED, EPOCH} <= numbers.keys():
+                    STATE, SPEED, EPOCH} <= numbers.keys():
                 self._heard_at = time.monotonic()
                 self._show_paused(numbers[STATE] == 'paused')
-                set_content(self._status, f'{status.message} · t = {float(numbers[TIME]):.1f} s '
-                            f'· {SPEED} {numbers[SPEED]}')
+                set_content(self._status, f'{status.message} · {SPEED} {numbers[SPEED]}')
                 epoch_ns = int(numbers[EPOCH])
                 if self._epoch_ns != epoch_ns:
                     self._epoch_ns, self._is_stale = epoch_ns, True

@@ -10,9 +10,8 @@ import numpy as np
 
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view.source import Motion, Reals, Track, effective_potential
+from spinning_top_sim.view.source import POINTS, Motion, Reals, Track, effective_potential
 
-POINTS = 400                    # in a line at most
 BLUE, RED, GREEN, VIOLET = '#1c6dd0', '#d9482b', '#1e8a4c', '#7a52b3'
 FLAT = 1e-3                     # least range of an axis / the greatest value
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340, 172, 46, 332, 38, 140        # [px]
@@ -50,9 +49,12 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
     Return the plots of potential, energies, tilt and precession, as far as there are data.
 
     t_ns : the time that is marked
-    begin_ns, end_ns : span of the plots over the time
+    begin_ns, end_ns : span of the plots over the time; of a fast motion they show a part
     """
-    times, states = track.states(begin_ns, end_ns, POINTS)
+    times, states = track.states(t_ns, begin_ns, end_ns)
+    longest_ns, label = POINTS * track.step_ns(begin_ns, end_ns), 'time t [s]'
+    if longest_ns < end_ns - begin_ns:
+        label += f', of this fast motion {longest_ns / NANOSECONDS:.2g} s at most'
     seconds, (w1, w2, w3), top = times / NANOSECONDS, states.rows_angular_velocity, track.top
     # Without the motion of the pivot.
     kinetic = 0.5 * (top.lambda1 * (w1 * w1 + w2 * w2) + top.lambda3 * w3 * w3) + 0.0 * seconds
@@ -62,12 +64,12 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
     return [
         Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', _potential(top, motion), theta,
              motion.energy if motion and motion.description else math.nan, 'tilt'),
-        Plot('Energy', 'time t [s]', 'E [J]', [
+        Plot('Energy', label, 'E [J]', [
             Line('kinetic', RED, seconds, kinetic), Line('potential', BLUE, seconds, height),
             Line('sum', GREEN, seconds, kinetic + height)], now),
-        Plot('Tilt', 'time t [s]', 'θ [deg]', [
+        Plot('Tilt', label, 'θ [deg]', [
             Line('θ', RED, seconds, np.degrees(states.theta_folded))], now),
-        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', [
+        Plot('Precession rate', label, 'φ′ [rad/s]', [
             Line('φ′', BLUE, seconds, states.phi_dot)], now)]
 
 
@@ -81,7 +83,7 @@ def _potential(body: Top, motion: Motion | None) -> list[Line]:
     depth = max(motion.energy - float(values.min()), 0.05 * abs(body.gravity_torque),
                 1e-6 * abs(motion.energy))
     shown = np.flatnonzero(values <= motion.energy + depth)
-    theta = np.linspace(theta[shown[0]], theta[shown[-1]], POINTS // 2)
+    theta = np.linspace(theta[shown[0]], theta[shown[-1]], 200)
     bounds = np.array([motion.description.theta_min, motion.description.theta_max])
     with np.errstate(all='ignore'):         # at the poles V may be infinite
         heights = effective_potential(body, l3, lz, bounds)

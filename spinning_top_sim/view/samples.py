@@ -29,10 +29,12 @@ class SampledTrack(Track):
         self.templates = {channel.topic: channel.template for channel in all_channels(
             values, self._imu) if channel.topic in TOPICS}
 
-    def times(self, begin_ns: int, end_ns: int) -> Times:
+    def times(self, begin_ns: int, end_ns: int, step_ns: int) -> Times:
         begin, end = np.searchsorted(self.stamps_ns, [begin_ns + self.epoch_ns,
                                                       end_ns + self.epoch_ns + 1])
-        return self.stamps_ns[begin:end] - self.epoch_ns
+        times = self.stamps_ns[begin:end] - self.epoch_ns
+        stride = max(1, step_ns * len(times) // (end_ns - begin_ns + 1))
+        return times[(len(times) - 1) % stride::stride]
 
     def newest(self, t_ns: int) -> int | None:
         index = int(np.searchsorted(self.stamps_ns, t_ns + self.epoch_ns, 'right')) - 1

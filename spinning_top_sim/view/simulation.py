@@ -22,7 +22,6 @@ from spinning_top_sim.view.page import Page, set_value
 from spinning_top_sim.view.player import Player
 from spinning_top_sim.view.source import WINDOW_NS, Track
 
-PERIOD_NS = 10_000_000          # between the points of a trace
 FILE_S = 20.0                   # length of a file, where `duration` is 0
 STEPS = 500                     # of a slider at least
 # Name, unit and meaning of each slider.
@@ -83,9 +82,9 @@ class SimulatedTrack(Track):
         self._simulation, self._reached_ns = Simulation(values), -1
         self.trajectory = self._simulation.trajectory
 
-    def times(self, begin_ns: int, end_ns: int) -> Times:
-        first = max(-(-begin_ns // PERIOD_NS), 0) * PERIOD_NS
-        return np.append(np.arange(first, end_ns, PERIOD_NS), end_ns)
+    def times(self, begin_ns: int, end_ns: int, step_ns: int) -> Times:
+        first = max(-(-begin_ns // step_ns), 0) * step_ns
+        return np.append(np.arange(first, end_ns, step_ns), end_ns)
 
     def at(self, times: Times) -> States:
         return self.trajectory.evaluate(times)

@@ -6,6 +6,7 @@ Times are integer nanoseconds since t = 0.
 """
 
 import contextlib
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from spinning_top_sim.times import NANOSECONDS, Times
 
 Reals = NDArray[np.float64]
 WINDOW_NS = 10 * NANOSECONDS    # of traces and plots; twice this is kept
+POINTS, FEWEST, PER_TURN = 2000, 500, 20    # in a span: most and least; in the fastest turn
+NUTATIONS = 4               # that a span has room for, however fast phi turns near a pole
 SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 SAME = 1e-6                 # relative difference between the constants of one motion
 
@@ -82,8 +85,8 @@ class Track(ABC):
         self._known: tuple[tuple[float, ...], Motion] | None = None     # the newest motion
 
     @abstractmethod
-    def times(self, begin_ns: int, end_ns: int) -> Times:
-        """Return the times (n,) of samples in a span, both ends included."""
+    def times(self, begin_ns: int, end_ns: int, step_ns: int) -> Times:
+        """Return times (n,) of samples in a span, a step apart if there are, with the last."""
 
     @abstractmethod
     def at(self, times: Times) -> States:
@@ -101,12 +104,28 @@ class Track(ABC):
         """Return the state (n = 1) at the time of a sample."""
         return self.at(np.array([t_ns]))
 
-    def states(self, begin_ns: int, end_ns: int, most: int) -> tuple[Times, States]:
-        """Return at most so many evenly chosen samples in a span, with the last one."""
-        times = self.times(begin_ns, end_ns)
-        stride = max(1, -(-len(times) // most))
-        chosen = times[(len(times) - 1) % stride::stride]
-        return chosen, self.at(chosen)
+    def step_ns(self, begin_ns: int, end_ns: int) -> int:
+        """Return the greatest step between samples in a span that shows its motions [ns]."""
+        longest_ns, top = max(1, (end_ns - begin_ns) // FEWEST), self.top
+        states = self.at(self.times(begin_ns, end_ns, 10 * longest_ns))
+        # At most so fast are a nutation, and the axis with its energy.
+        w1, w2, _ = states.rows_angular_velocity
+        rates = np.abs(states.l3) / top.lambda1 + np.sqrt(w1 * w1 + w2 * w2 + 2.0 / top.lambda1 * (
+            top.gravity_torque * states.rows_axis[2] + abs(top.gravity_torque)))
+        rate = float(np.max(rates, where=np.isfinite(rates), initial=1e-9))
+        motion = self.motion_at(end_ns)
+        found = motion.description if motion else None
+        if found and found.nutation_period:
+            most = math.tau / found.nutation_period * POINTS / (PER_TURN * NUTATIONS)
+            rate = max(rate, min(most, max(found.precession_max, -found.precession_min)))
+        return max(1, min(longest_ns, int(math.tau / (PER_TURN * rate) * NANOSECONDS)))
+
+    def states(self, t_ns: int, begin_ns: int, end_ns: int) -> tuple[Times, States]:
+        """Return samples in a span; if POINTS do not show it, in a shorter one around a time."""
+        step_ns = self.step_ns(begin_ns, end_ns)
+        end_ns = min(end_ns, max(t_ns, begin_ns + POINTS * step_ns))
+        times = self.times(max(begin_ns, end_ns - POINTS * step_ns), end_ns, step_ns)
+        return times, self.at(times)
 
     def motion_at(self, t_ns: int) -> Motion | None:
         """Return the motion at a time, by the newest sample; None if its rates are not known."""
