@@ -7,6 +7,7 @@ from helpers.bodies import FAULTS, NAMES, SWAPPED, body, rolled, told
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import Imu, grade_readings
+from spinning_top_sim.grade.bodies import held
 
 
 @pytest.mark.parametrize('noisy', [False, True])
@@ -148,3 +149,10 @@ def test_held_poses_are_told_and_nothing_is_graded_beside_them():
     t, q = parts['attitudes']
     held = q[np.floor(np.arange(len(q)) / 6.667).astype(int) * 20 // 3]
     assert grade_readings({**parts, 'attitudes': (t, held)}).faults == ['held']
+
+
+def test_a_body_that_rests_is_not_held():
+    moving = np.cumsum(np.full((600, 3), 0.01), axis=0)
+    resting = np.concatenate((moving, np.repeat(moving[-1:], 400, axis=0), moving + 9.0))
+    assert held('gyroscope', resting)[1] is None
+    assert held('gyroscope', np.repeat(moving, 2, axis=0))[1].number == 2.0

@@ -69,12 +69,15 @@ def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], Finding | None]:
     """Return which rows (n, k) are not those before, and the fault if each is told again."""
     new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
     runs = np.diff(np.flatnonzero(new))
-    if len(runs) < HELD_RUNS or np.mean(runs) < 1.3:
+    if len(runs) < HELD_RUNS:
         return new, None
-    usual, count = math.floor(float(np.median(runs))), float(np.mean(runs))
-    near = max(np.mean((runs == usual + k) | (runs == usual + k + 1)) for k in (-1, 0))
+    usual = math.floor(float(np.median(runs)))
+    # Others are longer: the body rests.
+    near = max((runs[(runs == usual + k) | (runs == usual + k + 1)] for k in (-1, 0)), key=len)
+    count = float(np.mean(near))
     return new, Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
-                        'log, is slower than its stamps', count) if near >= HELD_SHARE else None
+                        'log, is slower than its stamps', count) if (
+                            len(near) >= HELD_SHARE * len(runs) and count >= 1.3) else None
 
 
 def undone(body: Stretch, convention: Convention) -> Stretch:

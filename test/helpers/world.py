@@ -26,6 +26,7 @@ from spinning_top_sim.streams.live import LiveSimulation, Output
 from spinning_top_sim.streams.topics import resolve_topic
 
 DATE_NS, SOURCE_NS = 1_700_000_000 * SECOND, 500 * SECOND
+FASTEST = 3e4               # [rad/s]; the steps and the increments of faster motions take minutes
 QUIET_NS = 60 * MILLISECOND     # at the end, in which nothing happens
 QUEUE_BYTES = 20_000        # of the recorder, so that it is full sooner
 MOST_QUEUED = 10_000        # messages: a chunk, the queue, and what one tick may add
@@ -93,6 +94,7 @@ class World:
         self.events, self.logs, self.readers, self.numbers = [], [], [], itertools.count()
         self.answers, self.asked = [], 0
         self.wanted = {}                        # by topic of a subscriber: 'heard' or 'stalled'
+        self._is_too_fast = False
         self._lost_ticks = self._cost_ns = self._cost_until_ns = 0
         self._date_ns = self._jump_ns = self._stops_at_ns = 0
         self._drives, self.was_full, self.was_killed = [], False, True
@@ -116,6 +118,7 @@ class World:
     def _apply(self, kind, **details):
         event = LiveSimulation.apply(self.simulation, kind, **details)
         self.events.append(event)
+        self._is_too_fast = self.simulation.trajectory.after(event.t_ns).fastest_rate > FASTEST
         return event
 
     # -------------------------------------------------------------------------- its clocks
@@ -268,6 +271,8 @@ class World:
                 self._tick()
 
     def _tick(self):
+        if self._is_too_fast:
+            raise Killed
         if self._drives and self.loop.state is LoopState.RUNNING:
             with contextlib.suppress(ValueError, RuntimeError):     # the motion may end here
                 self.drive(len(self._drives) - 1, *self._drives[0])
