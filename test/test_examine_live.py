@@ -63,19 +63,6 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
             assert np.isnan(outcome.covariances).all()
 
 
-def test_what_a_node_says_is_passed_on_until_it_is_asked_to_end(tmp_path, capfd):
-    path = tmp_path / 'plain.py'
-    path.write_text(PLAIN.replace('rclpy.init()', "print('begin', file=sys.stderr); rclpy.init()"))
-    with live.NodeExam(f'{sys.executable} {path}', 'imu/data') as node:
-        node.start()
-    assert capfd.readouterr().err == 'begin\n'
-    path.write_text("raise SystemExit('it is broken')")
-    with (live.NodeExam(f'{sys.executable} {path}', 'imu/data') as node,
-          pytest.raises(RuntimeError, match='has ended with 1')):
-        node.start()
-    assert capfd.readouterr().err == 'it is broken\n'
-
-
 def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plain, monkeypatch):
     with live.NodeExam(plain(), 'imu/data') as node:
         (outcome,) = feeding.feed(node.start, [run])

@@ -6,11 +6,9 @@ import os
 import shlex
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
-from threading import Thread
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -92,13 +90,9 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Start the node anew; return it as a filter."""
         self._end_process()
         try:
-            self._process = subprocess.Popen(self._command, start_new_session=True,
-                                             stderr=subprocess.PIPE)
+            self._process = subprocess.Popen(self._command, start_new_session=True)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
-        self._reader = Thread(target=self._pass_on, args=[self._process, self._process.stderr],
-                              daemon=True)
-        self._reader.start()
         if not self._wait(lambda: self._imu.get_subscription_count()
                           and self._node.count_publishers(self._topic), PATIENCE_S):
             raise RuntimeError(
@@ -117,13 +111,6 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._answers.clear()
         self.covariance = None
         return self
-
-    def _pass_on(self, process: object, stderr: IO[bytes]) -> None:
-        """Print what a node says until it is asked to end: a traceback is usual then."""
-        with stderr:
-            for line in stderr:
-                if process is self._process:
-                    print(line.decode(errors='replace'), end='', file=sys.stderr, flush=True)
 
     def _check_alone(self) -> None:
         """Raise NodeError if another node publishes on a topic of the exam."""
@@ -188,7 +175,6 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             if time.monotonic() > end:
                 return False
             if self._process is not None and self._process.poll() is not None:
-                self._reader.join(AGAIN_S)      # the last words of the node come first
                 raise RuntimeError(f'the node has ended with {self._process.returncode}')
             self._executor.spin_once(timeout_sec=0.05)
         return True
