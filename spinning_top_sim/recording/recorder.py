@@ -206,7 +206,9 @@ class Recorder:
                 if closing:
                     file.finish()
                     return
-                if self._syncing is None or not self._syncing.is_alive():
+                if self._bytes_out == self._on_disk[1]:     # nothing new: no need to sync
+                    self._on_disk = now, self._bytes_out
+                elif self._syncing is None or not self._syncing.is_alive():
                     self._syncing = self._threads.Thread(
                         target=self._sync, args=(file, (now, self._bytes_out)),
                         name='recorder sync', daemon=True)
