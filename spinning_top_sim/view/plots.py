@@ -51,8 +51,9 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
     t_ns : the time that is marked
     begin_ns, end_ns : span of the plots over the time; of a fast motion they show a part
     """
-    times, states = track.states(t_ns, begin_ns, end_ns)
-    longest_ns, label = POINTS * track.step_ns(begin_ns, end_ns), 'time t [s]'
+    step_ns = track.step_ns(begin_ns, end_ns)
+    times, states = track.states(t_ns, begin_ns, end_ns, step_ns)
+    longest_ns, label = POINTS * step_ns, 'time t [s]'
     if longest_ns < end_ns - begin_ns:
         label += f', of this fast motion {longest_ns / NANOSECONDS:.2g} s at most'
     seconds, (w1, w2, w3), top = times / NANOSECONDS, states.rows_angular_velocity, track.top

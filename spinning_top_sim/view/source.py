@@ -120,9 +120,8 @@ class Track(ABC):
             rate = max(rate, min(most, max(found.precession_max, -found.precession_min)))
         return max(1, min(longest_ns, int(math.tau / (PER_TURN * rate) * NANOSECONDS)))
 
-    def states(self, t_ns: int, begin_ns: int, end_ns: int) -> tuple[Times, States]:
-        """Return samples in a span; if POINTS do not show it, in a shorter one around a time."""
-        step_ns = self.step_ns(begin_ns, end_ns)
+    def states(self, t_ns: int, begin_ns: int, end_ns: int, step_ns: int) -> tuple[Times, States]:
+        """Return samples with a step; if POINTS do not span it, of a part around a time."""
         end_ns = min(end_ns, max(t_ns, begin_ns + POINTS * step_ns))
         times = self.times(max(begin_ns, end_ns - POINTS * step_ns), end_ns, step_ns)
         return times, self.at(times)
