@@ -121,8 +121,11 @@ class Exam:
     @property
     def biased(self) -> Outcome:
         """A bias in a rest, and in one in which its axes of the world have other signs."""
-        run = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S).run('bias')
-        return self.outcome('bias', replace(run, gyroscope=run.gyroscope + BIAS))
+        def make() -> list[Run]:
+            motion = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S)
+            run = motion.run('bias')
+            return [replace(run, gyroscope=run.gyroscope + BIAS)]
+        return self.outcomes('bias', make)[0]
 
     @cached_property
     def heading(self) -> bool:
