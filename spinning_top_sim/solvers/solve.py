@@ -21,7 +21,7 @@ from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.solvers.vertical import Posture, PreciseState
 
 # Doubles do not hold the squares of larger rates [rad/s]; those of the spin are smaller anyway.
-FASTEST_RATE = 1e100
+FASTEST_AXIS = 1e100
 # They make a motion of the top, the start, its posture, rtol and atol.
 EQUATIONS: Mapping[str, Callable[..., Motion]] = {
     'transport': TransportMotion, 'euler': EulerMotion}
@@ -63,11 +63,11 @@ def motion_of(top: Top, start: State, *, method: str, equations: str = 'transpor
             raise ValueError(f'{name} = {shown(value)}: must be in [{least:g}, 1e-2]')
     try:
         now = posture or PreciseState.of(start).posture(top)
-        if not abs(now.transverse) <= FASTEST_RATE:
+        if not abs(now.transverse) <= FASTEST_AXIS:
             raise OverflowError
     except ArithmeticError:
         raise ValueError(f'{top} from {start}: the rate of the axis must be at most '
-                         f'{FASTEST_RATE:g} rad/s') from None
+                         f'{FASTEST_AXIS:g} rad/s') from None
     # Rounded to a state beside a pole, a posture that moves a little would rest.
     if method == 'rk45' and equations == 'transport' and posture is None and (
             top.gravity_torque == 0.0 or axis_rests(top, start)):
