@@ -56,8 +56,8 @@ def check_with_all_readers(path, messages) -> None:
 def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
     """The exit code says whether a message was in what is gone."""
     torn, output, seen = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap', {}
-    edges = [0, *(place for chunk in log.chunks for place in chunk[1:]), len(log.content)]
-    sizes = {cut for edge in edges for cut in range(edge - 10, edge + 11)
+    edges = [0, *(place for record in records_of(log.content) for place in record[1:])]
+    sizes = {cut for edge in edges for cut in (*range(edge - 3, edge + 4), edge + 10)
              if 0 <= cut <= len(log.content)}.union(range(0, len(log.content), 97))
     torn.write_bytes(log.content)
     for size in sorted(sizes, reverse=True):

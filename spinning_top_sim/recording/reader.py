@@ -208,7 +208,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _at(self, offset: int, end: int) -> bytes:
         """Return the bytes there.  Raises UNREADABLE if there are fewer, or too many."""
-        if end > min(self.size, offset + self._max_bytes):
+        if not offset <= end <= min(self.size, offset + self._max_bytes):
             raise McapError
         try:
             raw = os.pread(self._file.fileno(), end - offset, offset)

@@ -9,6 +9,7 @@ Layout: header, schemas, channels, metadata of the run | chunk, its message inde
 """
 
 import contextlib
+import errno
 import itertools
 import os
 import struct
@@ -255,9 +256,14 @@ def record_bytes(record: records.McapRecord) -> bytes:
 
 def _sync_directory(directory: Path) -> None:
     """Bring the names in a directory to the disk, if the file system can and lets us."""
-    with contextlib.suppress(OSError):
+    try:
         descriptor = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    except PermissionError:
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)

@@ -233,11 +233,11 @@ class Disk:
             machine.sleep(fault.value)
         return fault
 
-    def _after(self, fault, *, is_file=True):
+    def _after(self, fault):
         if fault.kind == 'kill':
             raise Killed
         if fault.kind in ('stop', 'error'):
-            self.failures += is_file
+            self.failures += 1
         if fault.kind == 'stop':
             self._machine.sleep()
         if fault.kind == 'error':
@@ -277,7 +277,7 @@ class Disk:
         self.is_misused |= not os.path.exists(f'/proc/self/fd/{descriptor}')
         if is_file and fault.kind == 'error':
             self._files[path].doubtful.update(range(self._files[path].synced, written))
-        self._after(fault, is_file=is_file)
+        self._after(fault)
         for name, file in self._files.items():
             if name == path:
                 file.synced = max(file.synced, written)
