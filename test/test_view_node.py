@@ -55,7 +55,6 @@ def test_a_running_node(desk, peer, tmp_path):
         wait_for('a step', lambda: view.update(0.0) > t_ns)
         # Another motion, whoever commands it.
         assert peer.set_together(node, spin__l3=2.0, spin__lz=1.5).successful
-        # /diagnostics of before the pause may have come after its answer.
         wait_for('the button', lambda: desk.inputs['Pause'].label == 'Resume')
         desk.press('Pause')
         wait_for('loops', lambda: motion() == 'loops')

@@ -100,12 +100,6 @@ class NodeView(Node):
             return
         refused = '' if answer.success else '**refused:** '
         self._page.message.content = f'{refused}{name.removeprefix("set_")}: {answer.message}'
-        if on and answer.success:
-            self._show_paused(on[0])
-
-    def _show_paused(self, paused: bool) -> None:
-        self._paused = paused
-        self._pause.label = 'Resume' if paused else 'Pause'
 
     # The thread of the executor.
 
@@ -129,7 +123,8 @@ class NodeView(Node):
             if status.name == self._name.lstrip('/') and {
                     STATE, SPEED, EPOCH} <= numbers.keys():
                 self._heard_at = time.monotonic()
-                self._show_paused(numbers[STATE] == 'paused')
+                self._paused = numbers[STATE] == 'paused'
+                self._pause.label = 'Resume' if self._paused else 'Pause'
                 set_content(self._status, f'{status.message} · {SPEED} {numbers[SPEED]}')
                 epoch_ns = int(numbers[EPOCH])
                 if self._epoch_ns != epoch_ns:
