@@ -122,8 +122,9 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, tmp_path, monk
         node.start()
     with live.NodeExam(plain(left_out=range(99)), 'imu/data') as node:
         filter_ = node.start()
-        monkeypatch.setattr(live, 'PATIENCE_S', 1.0)
-        with pytest.raises(RuntimeError, match='answers no sample within 1 s'):
+        with (monkeypatch.context() as patched,
+              pytest.raises(RuntimeError, match='answers no sample within 1 s')):
+            patched.setattr(live, 'PATIENCE_S', 1.0)
             filter_.update(run.gyroscope[0], run.accelerometer[0], None, 0.01)
     other = tmp_path / 'other.py'
     other.write_text(PLAIN.replace('import Imu', 'import Imu, Range').replace(
@@ -132,6 +133,7 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, tmp_path, monk
           pytest.raises(feeding.NodeError, match=r'imu/data has the type sensor_msgs/msg/Range: '
                                                  'must be sensor_msgs/msg/Imu')):
         node.start()
+    monkeypatch.setattr(live, 'PATIENCE_S', 1.0)
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
         feeding.feed(node.start, [run])
