@@ -12,13 +12,12 @@ import yaml  # type: ignore[import-untyped]
 from helpers import simulations
 from helpers.reference import ROOT
 
-from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import connect, main
-from spinning_top_sim.tools.ensemble_part import compute_part, table_of_run
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
 parquet = pytest.importorskip('pyarrow.parquet')
+ensemble_runs = pytest.importorskip('spinning_top_sim.tools.ensemble_runs')
 
 RUNS, DURATION = 12, 1.0
 SPEC = {
@@ -40,6 +39,14 @@ def written(folder, **changes):
     return path
 
 
+def specified(folder, **content):
+    """Return a specification; what is empty in the parameter files of rcl is unset."""
+    path = folder / 'spec.yaml'
+    path.write_text(yaml.safe_dump({'duration': 1.0, **content},
+                                   sort_keys=False).replace('null', ''))
+    return ensemble_runs.read(path)
+
+
 def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes()
             for path in folder.rglob('*') if path.is_file()}
@@ -47,10 +54,10 @@ def contents(folder):
 
 def parts_of(specification, folder):
     """Compute all parts without Dask; none of their runs fails."""
-    (folder / 'data').mkdir()
-    for part in range(len(specification.parts)):
-        assert compute_part(specification, part, str(folder)) == {}
-    return folder / 'data'
+    folder.mkdir()
+    for rows in specification.parts():
+        assert ensemble_runs.compute_part(specification, folder, rows) == {}
+    return folder
 
 
 @pytest.fixture(scope='module')
@@ -72,14 +79,14 @@ def whole(tmp_path_factory):
     """Return the data of the ensemble, computed without Dask, and its specification."""
     folder = tmp_path_factory.mktemp('ensemble')
     path = written(folder)
-    return parts_of(ensemble_spec.read(path), folder), path
+    return parts_of(ensemble_runs.read(path), folder / 'data'), path
 
 
-def test_every_stream_has_columns():
-    names = list(ensemble_spec.STREAMS)
-    row = table_of_run(ensemble_spec.parse({
-        'runs': 1, 'duration': 0.1, 'streams': names,
-        'sample': {'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}}}, 'test'), 0).to_pylist()[0]
+def test_every_stream_has_columns(tmp_path):
+    specification = specified(tmp_path, runs=1, duration=0.1, streams=[*ensemble_runs.STREAMS],
+                              sample={'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}})
+    (part,) = specification.parts()
+    row = ensemble_runs.table_of_run(specification, *part).to_pylist()[0]
     assert row['joint_states.position.nutation_joint'] == pytest.approx(np.radians(30.0))
     assert row['~/invariants.data.l3'] == 1.6
     assert row['imu.lever_arm'] == [0.1, 0.0, 0.0]
@@ -92,8 +99,8 @@ def test_every_stream_has_columns():
 def test_a_run_has_the_samples_that_simulate_sends(whole):
     """Also where the IMU loses samples, and sends some twice."""
     (folder, path), run = whole, 7
-    specification = ensemble_spec.read(path)
-    values = specification.values(specification.drawn(run))
+    specification = ensemble_runs.read(path)
+    values = specification.values(specification.parts()[run][0])
     every = parquet.read_table(folder)
     rows = every.filter(every['run'].to_numpy() == run)
     assert values['imu.rate'] == [100.0, 200.0][run % 2]
@@ -130,7 +137,7 @@ def test_interrupted_killed_and_torn_it_makes_the_same_dataset(
 
     monkeypatch.setattr(Future, 'result', result)
     assert [ensemble(path, '-o', folder) for _ in range(2)] == [130, 1]
-    assert not json.loads((folder / 'manifest.json').read_text())['complete']
+    assert not (folder / 'failed.json').exists()
     cluster.gather([cluster.submit(os.getpid, workers=[one], pure=False)    # after running tasks
                     for one in cluster.scheduler_info()['workers']])
     *torn, kept = sorted((folder / 'data').iterdir())
@@ -141,10 +148,9 @@ def test_interrupted_killed_and_torn_it_makes_the_same_dataset(
         assert ensemble(path, '-o', folder) == 0
         assert contents(folder / 'data') == contents(data)
         assert (kept.stat().st_ino, kept.stat().st_mtime_ns) == then
-    manifest = json.loads((folder / 'manifest.json').read_text())
-    assert manifest['complete'] and manifest['failed'] == {}
-    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
-    assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
+    assert json.loads((folder / 'failed.json').read_text()) == {}
+    versions = json.loads((folder / 'manifest.json').read_text())['versions']
+    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(versions)
     # No other ensemble goes there, nor where other files are.
     other = written(tmp_path, runs=1)
     assert ensemble(other, '-o', folder) == ensemble(other, '-o', tmp_path) == 2
@@ -160,70 +166,74 @@ def test_failed_runs_are_told_with_their_reason(
         assert ensemble(path, '-o', tmp_path / 'other') == code
         said = capsys.readouterr().err
         assert said.startswith(f'spinning-top ensemble: {len(failed)} of 2 runs failed, see ')
-        why = json.loads((tmp_path / 'other/manifest.json').read_text())['failed']
+        why = json.loads((tmp_path / 'other/failed.json').read_text())
         assert list(why) == failed
-        assert 'ValueError: no motion from State(theta=' in why['1'] and 'spin.lz = ' in why['1']
+        assert 'ValueError: no motion from State(theta=' in why['1'] and "'spin.lz': " in why['1']
 
 
-def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():
-    given = {'runs': 2030, 'duration': 1.0, 'seed': 3}
+def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(tmp_path):
     lists = {'initial.theta': {'values': [0.1, 0.2]}}
-    one = ensemble_spec.parse({**given, 'sample': {'spin.l3': {'uniform': [1, 3]}, **lists}}, '')
-    more = ensemble_spec.parse({**given, 'sample': {
+    one = specified(tmp_path, runs=300, seed=3, sample={'spin.l3': {'uniform': [1, 3]}, **lists})
+    more = specified(tmp_path, runs=2030, seed=3, sample={
         'top.mass': {'log_uniform': [0.1, 10.0]}, 'spin.l3': {'uniform': [1.0, 3.0]},
-        'spin.lz': {'normal': [2.0, 0.5]}, **lists, 'imu.rate': {'values': [10, 20, 30]}}}, '')
-    assert [run for part in more.parts for run in part] == [*range(2030)] and len(more.parts) == 51
-    drawn = [more.drawn(run) for run in range(2000)]
-    for run in (0, 1, 1999):
-        assert one.drawn(run).items() <= drawn[run].items()
+        'spin.lz': {'normal': [2.0, 0.5]}, **lists, 'imu.rate': {'values': [10, 20, 30]}}).parts()
+    drawn = [row for part in more for row in part]
+    assert [row['run'] for row in drawn] == [*range(2030)] and len(more) == 51
+    for part in one.parts():
+        for row in part:
+            assert row.items() <= drawn[row['run']].items()
     columns = {name: np.array([row[name] for row in drawn]) for name in drawn[0]}
     # Five standard errors of the mean, and of the standard deviation.
     for values, mean, deviation in (
             (columns['spin.l3'], 2.0, 1.0 / np.sqrt(3.0)), (columns['spin.lz'], 2.0, 0.5),
             (np.log10(columns['top.mass']), 0.0, 1.0 / np.sqrt(3.0))):
-        assert abs(values.mean() - mean) < 5.0 * deviation / np.sqrt(2000)
-        assert abs(values.std() - deviation) < 5.0 * deviation / np.sqrt(2 * 2000)
-    assert len(set(columns['seed'].tolist())) == 2000
+        assert abs(values.mean() - mean) < 5.0 * deviation / np.sqrt(2030)
+        assert abs(values.std() - deviation) < 5.0 * deviation / np.sqrt(2 * 2030)
+    assert len(set(columns['seed'].tolist())) == 2030
     pairs = list(zip(columns['initial.theta'], columns['imu.rate'], strict=True))
     assert pairs[:6] == pairs[6:12] and len(set(pairs[:6])) == 6
-    assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(2000)
+    assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(2030)
 
 
 def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_path):
-    """A magnetometer in one IMU, a run without rows, an outage; a value unset in some runs."""
+    """A magnetometer in one IMU, an outage; a value unset in some runs."""
     sets = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
-    specification = ensemble_spec.parse({'runs': 8, 'duration': 0.3, 'sample': {
-        'params': {'values': [*sets, {'record.streams': ['gnss']}, {
-            'gnss.enabled': True, 'gnss.outages': [0.05, 0.15]}]},
-        'spin.lz': {'values': [None, 1.4]}}}, 'test')
-    runs = [table_of_run(specification, run) for run in range(8)]
-    whole, joined = parquet.read_table(parts_of(specification, tmp_path)), pa.concat_tables(runs)
+    specification = specified(
+        tmp_path, runs=6, duration=0.3, streams=['imu', 'mag', 'gnss'], sample={
+            'params': {'values': [*sets, {'gnss.outages': [0.05, 0.15]}]},
+            'spin.lz': {'values': [None, 1.4]}})
+    runs = [ensemble_runs.table_of_run(specification, *part) for part in specification.parts()]
+    whole, joined = parquet.read_table(
+        parts_of(specification, tmp_path / 'data')), pa.concat_tables(runs)
     assert whole.schema.equals(joined.schema)
     assert repr(whole.to_pydict()) == repr(joined.to_pydict())      # with the same NaN
     mag = [one['imu/mag.magnetic_field.x'] for one in runs]
-    assert [len(column) - column.null_count for column in mag] == [0, 31, 0, 0] * 2
-    assert [len(one) > 0 for one in runs] == [True, True, False, True] * 2
-    assert [set(one['spin.lz'].to_pylist()) for one in runs] == [
-        {None}, {None}, set(), {None}, {1.4}, {1.4}, set(), {1.4}]
+    assert [len(column) - column.null_count for column in mag] == [31, 31, 31] * 2
+    assert [set(one['spin.lz'].to_pylist()) for one in runs] == 3 * [{None}] + 3 * [{1.4}]
     for topic, field, lost in (('fix', 'status.status', -1.0),
                                ('velocity', 'twist.twist.linear.x', None)):
-        seen = runs[3].filter(pa.array(np.isin(runs[3]['t'], (0.0, 0.1, 0.2, 0.3))))
+        seen = runs[2].filter(pa.array(np.isin(runs[2]['t'], (0.0, 0.1, 0.2, 0.3))))
         cells = seen[f'gnss/{topic}.{field}'].to_pylist()
         assert [cell == lost for cell in cells] == [False, True, False, False]
 
 
 @pytest.mark.parametrize(('changes', 'said'), [
     ({'sample': {'spin.l4': {'uniform': [1, 2]}}},
-     'spin.l4: there is no such parameter; did you mean spin.l'),
+     'there is no parameter spin.l4; did you mean spin.l'),
     ({'params': ['none.yaml']}, 'none.yaml: No such file'),
-    ({'sample': {'params': {'uniform': [1, 2]}}}, 'there is no such parameter'),
-    ({'sample': {'spin.l3': {'gauss': [1, 2]}}}, 'must be one of uniform, normal, log_uniform'),
-    ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, 'uniform = [2, 1]: must be [low, high] with'),
+    ({'sample': {'params': {'uniform': [1, 2]}}}, '1: must be a parameter file'),
+    ({'sample': {'params': {'values': [{'spin.l4': 1.0}]}}}, 'there is no parameter spin.l4'),
+    ({'sample': {'spin.l3': {'gauss': [1, 2]}}}, "{'gauss': [1, 2]}: must be values with a list"),
+    ({'sample': {'spin.l3': {'uniform': [2, 1]}}}, '[2, 1]}: must be values'),
+    ({'sample': {'spin.l3': {'normal': [1, -1]}}}, '[1, -1]}: must be values'),
+    ({'sample': {'spin.l3': {'log_uniform': [0, 1]}}}, '[0, 1]}: must be values'),
+    ({'sample': {'spin.l3': {'values': []}}}, '[]}: must be values'),
     ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
-    ({'sample': {'markers.trace_points': {'uniform': [1, 2]}}}, 'must be values'),
-    ({'sample': {'use_sim_time': {'values': [True]}}}, 'there is no such parameter'),
+    ({'sample': {'imu.rate': {'values': [100, 'x']}}}, "imu.rate = 'x': must be a number"),
+    ({'sample': {'markers.trace_points': {'uniform': [1.5, 2]}}}, '1.5: must be an integer'),
+    ({'sample': {'use_sim_time': {'values': [True]}}}, 'there is no parameter use_sim_time'),
     ({'streams': ['imu', 'markers']}, 'must be one of pose'),
-    ({'streams': [], 'params': [{'record.streams': ['clock']}]}, 'no stream is enabled'),
+    ({'duration': 0}, 'duration = 0: must be a number >= 1e-09'),
     ({'run': 3}, 'must be a mapping with runs'), ({'--workers': '0'}, '--workers 0: must be')])
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     workers = changes.get('--workers', '1')

@@ -18,7 +18,7 @@ from helpers.recordings import METADATA, TOPICS, rows_of
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
-from spinning_top_sim.tools import ensemble_part, ensemble_spec, inspect, simulate
+from spinning_top_sim.tools import inspect, simulate
 
 FAILURES = (errno.ENOSPC, errno.EIO, errno.EINTR, None)
 
@@ -137,17 +137,16 @@ def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
 
 
 def test_of_a_part_of_an_ensemble(tmp_path):
-    pytest.importorskip('pyarrow')
-    specification = ensemble_spec.parse({
-        'runs': 2, 'duration': 0.1, 'sample': {'spin.l3': {'uniform': [1.0, 2.0]}},
-        'streams': ['pose']}, 'specification')
+    ensemble_runs = pytest.importorskip('spinning_top_sim.tools.ensemble_runs')
+    (tmp_path / 'spec.yaml').write_text('{runs: 1, duration: 0.1, streams: [pose]}')
+    specification = ensemble_runs.read(tmp_path / 'spec.yaml')
 
     def computed(folder):
-        (folder / 'data').mkdir(parents=True, exist_ok=True)
-        return ensemble_part.compute_part(specification, 0, str(folder))
+        folder.mkdir(exist_ok=True)
+        return ensemble_runs.compute_part(specification, folder, *specification.parts())
 
     def content(folder):
-        return [path.read_bytes() for path in (folder / 'data').glob('part-*')]
+        return [path.read_bytes() for path in folder.glob('part-*')]
 
     assert computed(tmp_path / 'expected') == {}
     (expected,) = content(tmp_path / 'expected')

@@ -10,7 +10,7 @@ number alone. The same command again computes the files that are missing, such
 as after an interruption.
 
 exit codes:
-  0    done; the manifest has the runs that failed, with parameters and reasons
+  0    done; failed.json has the runs that failed, with parameters and reasons
   1    every run failed, a file cannot be read or written, or the cluster is lost
   2    wrong arguments or specification
   130  interrupted
@@ -25,21 +25,19 @@ import logging
 import platform
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import needed, version
-from spinning_top_sim.tools import cli, ensemble_spec
-from spinning_top_sim.tools.ensemble_part import DATA, compute_part
+from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
     import distributed
 
-MANIFEST = 'manifest.json'
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 CONFIGURATION = {
     'distributed.worker.profile.enabled': False,        # it grows with time
@@ -71,62 +69,46 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ValueError(f'--workers {arguments.workers}: must be >= 1')
     with needed('an ensemble', 'ensemble'):     # before anything is written
         import distributed  # noqa: PLC0415
-        import pyarrow  # noqa: F401, PLC0415
 
-    specification = ensemble_spec.read(arguments.specification)
-    folder = arguments.output.absolute()
+        from spinning_top_sim.tools import ensemble_runs  # noqa: PLC0415
+    specification = ensemble_runs.read(arguments.specification)
+    folder, runs = arguments.output.absolute(), specification.runs
     # The bytes of a dataset depend on these versions, too.
-    manifest: dict[str, Any] = {
-        'complete': False, 'specification': asdict(specification), 'failed': {}, 'versions': {
+    manifest, text = folder / 'manifest.json', json.dumps({
+        'specification': asdict(specification), 'versions': {
             'python': platform.python_version(), 'machine': platform.machine(),
-            **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}}
-    if folder.exists() and any(folder.iterdir()) and not _is_of(folder / MANIFEST, manifest):
+            **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}},
+        indent=1)
+    if folder.exists() and any(folder.iterdir()) and not (
+            manifest.is_file() and manifest.read_text('utf-8') == text):
         raise ValueError(f'{folder}: it has other files, another ensemble, or one of other '
                          'versions: choose a new folder')
-    failed: dict[str, str] = {}
-    with (cli.progress('computed', specification.runs, 'runs', quiet=arguments.quiet) as show,
+    data, failed = folder / 'data', dict[str, str]()
+    with (cli.progress('computed', runs, 'runs', quiet=arguments.quiet) as show,
           connect(arguments.workers, arguments.scheduler) as client):
-        (folder / DATA).mkdir(parents=True, exist_ok=True)
-        _write_manifest(folder, manifest)
+        data.mkdir(parents=True, exist_ok=True)
+        manifest.write_text(text, 'utf-8')
         # If a worker is killed, another one computes its task again.
-        tasks = client.map(partial(compute_part, specification, folder=str(folder)),
-                           list(range(len(specification.parts))), pure=False)
+        tasks = client.map(partial(ensemble_runs.compute_part, specification, data),
+                           specification.parts(), pure=False)
         try:
             for done, part in enumerate(distributed.as_completed(tasks, loop=client.loop), 1):
                 failed.update(part.result())
-                show(specification.runs * done / len(tasks))
+                show(runs * done / len(tasks))
         except (distributed.KilledWorker, distributed.comm.CommClosedError,
                 concurrent.futures.CancelledError, asyncio.CancelledError) as error:
             raise RuntimeError('the scheduler is lost, or several workers died of one task: '
                                f'{error}') from error
-    failed = dict(sorted(failed.items(), key=lambda item: int(item[0])))
-    _write_manifest(folder, {**manifest, 'complete': True, 'failed': failed})
-    for path in (folder / DATA).glob('.*'):     # of a worker that was killed
+    for path in data.glob('.*'):                # of a worker that was killed
         path.unlink()
-    if failed:
-        run, reason = next(iter(failed.items()))
-        cli.print_line(f'spinning-top ensemble: {len(failed)} of {specification.runs} runs failed'
-                       f', see {MANIFEST}; run {run}: {reason}', sys.stderr)
+    failed = dict(sorted(failed.items(), key=lambda item: int(item[0])))
+    (folder / 'failed.json').write_text(json.dumps(failed, indent=1), 'utf-8')
+    for run, reason in [*failed.items()][:1]:
+        cli.print_line(f'spinning-top ensemble: {len(failed)} of {runs} runs failed, see '
+                       f'failed.json; run {run}: {reason}', sys.stderr)
     if not arguments.quiet:
-        cli.print_line(f'{arguments.output}: {specification.runs - len(failed)} runs')
-    return cli.FAILED if len(failed) == specification.runs else cli.OK
-
-
-def _is_of(path: Path, manifest: Mapping[str, Any]) -> bool:
-    """Return whether a file is a manifest of the same runs."""
-    try:
-        old = json.loads(path.read_bytes())
-        # As text: the order in entries counts, as in a grid of samples.
-        return all(json.dumps(old[key]) == json.dumps(manifest[key])
-                   for key in ('specification', 'versions'))
-    except (FileNotFoundError, ValueError, LookupError, TypeError):
-        return False
-
-
-def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    written = folder / f'{MANIFEST}.new'
-    written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
-    written.replace(folder / MANIFEST)
+        cli.print_line(f'{arguments.output}: {runs - len(failed)} runs')
+    return cli.FAILED if len(failed) == runs else cli.OK
 
 
 @contextlib.contextmanager

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The runs of an ensemble: their specification, the table of one, and the file of a part of them.
+
+A file gets its name when it is whole.  One that is there already is not computed again.
+"""
+
+import contextlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import parquet
+
+from spinning_top_sim.physics.top import shown
+from spinning_top_sim.recording.errors import reason_of
+from spinning_top_sim.streams import parameters, topics
+from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.parameter import Parameter, Range
+from spinning_top_sim.streams.play import Simulation
+from spinning_top_sim.times import NANOSECONDS
+from spinning_top_sim.tools.scene_file import likely_name, parse_section, parse_yaml, read_scene
+
+Row = Mapping[str, Any]         # what a run has of its own: its number, seed, sampled parameters
+EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
+FAILED_KEY = b'failed'          # of the metadata of a file: why runs failed, by run
+# A part has so much simulated time [s] at most, or one run; more takes more memory and is no
+# faster.  A large ensemble has at least so many parts.
+PART_S, LEAST_PARTS = 250.0, 50
+VALUES, PARAMS, SAMPLE = 'values', 'params', 'sample'
+# Streams that a table can have; only a log has the others.
+STREAMS = tuple(name for name in parameters.STREAMS if name not in ('clock', 'markers'))
+ENTRIES = (
+    Parameter('runs', '', 1, Range(1, 10 ** 8)), parameters.BY_NAME['seed'],
+    replace(parameters.BY_NAME['duration'], range=Range(1e-9, parameters.LONGEST)),
+    Parameter('streams', '', choices=STREAMS, default=tuple(
+        name for name in STREAMS if parameters.BY_NAME[f'{name}.enabled'].default)))
+# By name, the function that draws n numbers by two others.  Raises ValueError or OverflowError.
+DISTRIBUTIONS: Mapping[str, Callable[..., Any]] = {
+    'uniform': np.random.Generator.uniform, 'normal': np.random.Generator.normal,
+    'log_uniform': lambda random, low, high, n: np.exp(
+        random.uniform(math.log(low), math.log(high), n))}
+# Names of the numbers in fields of messages, where they are not x, y, z and w.
+LABELS: Mapping[str, Sequence[str]] = {
+    '~/invariants.data': topics.INVARIANTS, 'ground_truth/imu_timing.data': topics.TIMING,
+    **dict.fromkeys(('joint_states.position', 'joint_states.velocity'), topics.JOINTS),
+    **dict.fromkeys(('gnss/fix.position', 'ground_truth/gnss/fix.position'),
+                    ('latitude', 'longitude', 'altitude'))}
+
+
+@dataclass(frozen=True)
+class Specification:
+    """
+    What the runs of an ensemble are.
+
+    runs, seed : number of runs, and the seed of all random numbers
+    duration : of a run [s]
+    streams : names of those that the table has
+    sets : parameters; which set a run has is sampled by its number, as `params`
+    sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
+    """
+
+    runs: int
+    seed: int
+    duration: float
+    streams: Sequence[str]
+    sets: Sequence[Mapping[str, Any]]
+    sample: Mapping[str, Mapping[str, Sequence[Any]]]
+
+    def parts(self) -> list[list[Row]]:
+        """
+        Return the runs that one task computes each, and that share a file.
+
+        What is drawn for a name depends on neither the other names nor the number of runs.  Lists
+        of values span a grid, again and again, in which the first list changes fastest.
+        """
+        runs, size = range(self.runs), 1
+        columns = {'run': runs, 'seed': self._random('seed').integers(
+            2 ** 63, size=self.runs).tolist()}
+        for name, rule in self.sample.items():
+            (kind, items), = rule.items()
+            if kind == VALUES:
+                columns[name] = [items[run // size % len(items)] for run in runs]
+                size *= len(items)
+            else:
+                columns[name] = DISTRIBUTIONS[kind](self._random(name), *items, self.runs).tolist()
+        rows: list[Row] = [{name: column[run] for name, column in columns.items()} for run in runs]
+        count = max(1, min(int(PART_S / self.duration), self.runs // LEAST_PARTS))
+        return [rows[first:first + count] for first in range(0, self.runs, count)]
+
+    def _random(self, name: str) -> np.random.Generator:
+        return np.random.default_rng((self.seed, *name.encode()))
+
+    def values(self, row: Row) -> dict[str, Any]:
+        """Return the checked parameters of a run.  Raises ValueError."""
+        own = {name: value for name, value in row.items() if name not in ('run', PARAMS)}
+        return parameters.checked(
+            {**self.sets[row.get(PARAMS, 0)], 'duration': self.duration, **own})
+
+
+def read(path: Path) -> Specification:
+    """
+    Return the specification in a YAML file; paths in it are relative to its folder.
+
+    Raises OSError, or ValueError, which names the file, the value and what is allowed.
+    """
+    content = parse_yaml(path.read_bytes(), str(path))
+    known = {*(entry.name for entry in ENTRIES), PARAMS, SAMPLE}
+    try:
+        if not (isinstance(content, Mapping) and {'runs', 'duration'} <= content.keys() <= known
+                and isinstance(content.get(PARAMS, []), list)
+                and isinstance(content.get(SAMPLE, {}), Mapping)):
+            raise ValueError(f'{shown(content)}: must be a mapping with runs and duration, of '
+                             f'{", ".join(sorted(known))}; params a list, sample a mapping')
+        common, sets = dict[str, Any](), [dict[str, Any]()]
+        for one in content.get(PARAMS, []):
+            common |= _parameter_set(path.parent, one)
+        sample = {name: _rule(name, rule, path.parent)
+                  for name, rule in content.get(SAMPLE, {}).items()}
+        if PARAMS in sample:
+            sets = sample[PARAMS][VALUES]
+            sample[PARAMS] = {VALUES: [*range(len(sets))]}
+        return Specification(
+            **{entry.name: entry.check(content.get(entry.name, entry.default))
+               for entry in ENTRIES}, sets=[{**common, **one} for one in sets], sample=sample)
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from error
+
+
+def _parameter_set(folder: Path, given: object) -> dict[str, Any]:
+    if isinstance(given, Mapping):
+        return parse_section(given, PARAMS)
+    if isinstance(given, str):
+        return read_scene(folder / given)
+    raise ValueError(f'params: {shown(given)}: must be a parameter file, or parameters and their '
+                     'values')
+
+
+def _rule(name: str, rule: object, folder: Path) -> dict[str, list[Any]]:
+    """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
+    if name not in (PARAMS, *parameters.BY_NAME):
+        raise ValueError(f'sample: there is no parameter {name}{likely_name(name)}')
+    check = partial(_parameter_set, folder) if name == PARAMS else parameters.BY_NAME[name].check
+    refusal = ValueError(
+        f'sample: {name} = {shown(rule)}: must be values with a list, uniform with [low, high], '
+        'log_uniform with such above 0, or normal with [mean, deviation]')
+    if not (isinstance(rule, Mapping) and len(rule) == 1 and rule.keys() <= {
+            VALUES, *DISTRIBUTIONS}):
+        raise refusal
+    (kind, items), = rule.items()
+    if not isinstance(items, list) or not items:
+        raise refusal
+    if kind == VALUES:
+        return {kind: [*map(check, items)]}
+    try:
+        low, high = map(float, items)
+        DISTRIBUTIONS[kind](np.random.default_rng(0), low, high, 1)
+    except (TypeError, ValueError, OverflowError):
+        raise refusal from None
+    for bound in items[:1] if kind == 'normal' else items:
+        check(bound)
+    return {kind: [low, high]}
+
+
+def _column_names(channel: Channel) -> list[str]:
+    """Return the names of the numbers in the fields of a message."""
+    names = []
+    for field, count, _ in channel.template.fields:
+        name = f'{channel.topic}.{field}'
+        labels = LABELS.get(name, 'xyzw'[:count] if count <= 4 else range(count))
+        names += [name] if count == 1 else [f'{name}.{label}' for label in labels]
+    return names
+
+
+def table_of_run(specification: Specification, row: Row) -> pa.Table:
+    """
+    Play a run; return what it has of its own, t [s], and the numbers of its streams.
+
+    A line has the samples of one time; where a stream has none, its columns are null.  All runs
+    have the same columns.  Raises ValueError for parameters that are not allowed, and
+    IntegrationError if the motion ends early.
+    """
+    values = specification.values(row)
+    simulation = Simulation(values, EPOCH_NS)
+    # Times and messages of each channel, block by block.
+    sent = {channel: ([np.empty(0, np.int64)], [np.empty((0, len(channel.template)), np.uint8)])
+            for channel in simulation.channels if channel.name in specification.streams}
+    for block in simulation.play([*sent], round(values['duration'] * NANOSECONDS)):
+        for channel, times_ns, messages in block.messages:
+            sent[channel][0].append(times_ns)
+            sent[channel][1].append(messages)
+    known_ns = {channel: np.concatenate(times) for channel, (times, _) in sent.items()}
+    t_ns = np.unique(np.concatenate([*known_ns.values()]))
+    # An unset value (spin.lz) is a null of the type that the other runs have.
+    columns = {name: pa.repeat(pa.scalar(value, pa.float64() if value is None else None),
+                               len(t_ns)) for name, value in row.items()}
+    columns['t'] = pa.array(t_ns / NANOSECONDS)
+    for channel, (_, blocks) in sent.items():
+        cells = np.hstack(channel.template.decode(np.concatenate(blocks))).T.astype(np.float64)
+        absent = None
+        if not np.array_equal(known_ns[channel], t_ns):
+            # A faulty sensor sends some samples twice; they share a line.
+            known, cells = cells, np.zeros((len(cells), len(t_ns)))
+            cells[:, np.searchsorted(t_ns, known_ns[channel])] = known
+            absent = ~np.isin(t_ns, known_ns[channel])
+        columns.update((name, pa.array(column, mask=absent)) for name, column in zip(
+            _column_names(channel), cells, strict=True))
+    return pa.table(columns)
+
+
+def compute_part(specification: Specification, folder: Path, rows: Sequence[Row],
+                 ) -> dict[str, str]:
+    """
+    Compute the file of some runs if it is missing; return why runs of it failed, by run.
+
+    Raises OSError.
+    """
+    path = folder / f'part-{rows[0]["run"]:08d}.parquet'
+    with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
+        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED_KEY]))
+    tables, failed = [], {}
+    for row in rows:
+        try:
+            tables.append(table_of_run(specification, row))
+        except Exception as error:
+            failed[str(row['run'])] = f'{reason_of(error)}; it has {row}'
+    if tables:
+        table = pa.concat_tables(tables).combine_chunks().replace_schema_metadata(
+            {FAILED_KEY: json.dumps(failed)})
+        written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
+        parquet.write_table(
+            table, written, compression='lz4', use_dictionary=[*rows[0]], use_byte_stream_split=[
+                name for name in table.column_names if name not in rows[0]])
+        written.replace(path)
+    return failed
