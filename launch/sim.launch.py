@@ -19,7 +19,7 @@ from launch_ros.actions import Node
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import resolve_topic
-from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
+from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))
 SCENES = sorted(path.stem for path in (SHARE / 'config').glob('*.yaml'))
@@ -74,13 +74,13 @@ def _nodes(context: LaunchContext) -> list:
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
     asked = dict(map(parse_assignment, shlex.split(given['set'])))
-    of_ros = {name: asked.pop(name) for name in list(asked) if is_of_ros(name)}
+    of_ros = {name: asked.pop(name) for name in list(asked) if parameters.is_of_ros(name)}
     if 'use_sim_time' in of_ros:
         raise ValueError(f'set = {given["set"]!r}: use_sim_time is an argument of its own, '
                          'use_sim_time:=true')
     changes, values = _parameters(given, namespace, files, asked)
     options = [('--params', str(path)) for path in files] + [
-        ('-p', f'{name}:={json.dumps(values[name])}') for name in changes]
+        ('-p', f'{name}:={json.dumps(values[name])}') for name in changes if name in values]
     actions = [Node(
         package='spinning_top_sim', executable='sim_node', namespace=namespace, output='screen',
         sigterm_timeout='15', on_exit=Shutdown(reason='it has ended'),

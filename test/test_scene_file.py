@@ -127,7 +127,7 @@ def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(
         assert read_scene(path, node) == {'top.mass': 5.0}
     path.write_text('another_name:\n  ros__parameters:\n    top.mass: 5\n')
     assert read_scene(path, '/left/another_name') == {'top.mass': 5.0}
-    path.write_text('/left/other: {ros__parameters: {a: 1}}\nb: {c: {ros__parameters: {}}}')
+    path.write_text('/left/other: {ros__parameters: {a: 1}}\nb: {c: {ros__parameters: {a: 1}}}')
     with pytest.raises(ValueError, match=r'for the node /a/spinning_top: .* nodes: /left/other, '
                        '/b/c'):
         read_scene(path, '/a/spinning_top')

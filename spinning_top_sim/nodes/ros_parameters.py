@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect, Parameter
-from spinning_top_sim.tools.scene_file import OF_RCLPY, likely_name
+from spinning_top_sim.tools.scene_file import likely_name
 
 SPIN = ('spin.l3', 'spin.lz')
 
@@ -26,7 +26,7 @@ def take_overrides(node: Node) -> dict[str, Any]:
     found = {name: node.get_parameter(name).value for name in node.get_parameters_by_prefix('')}
     if not isinstance(found['use_sim_time'], bool):
         raise ValueError(f'use_sim_time = {found["use_sim_time"]!r}: must be true or false')
-    given = {name: value for name, value in found.items() if name not in OF_RCLPY}
+    given = {name: value for name, value in found.items() if name not in parameters.OF_ROS}
     for name in given:
         node.undeclare_parameter(name)
     return given

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from spinning_top_sim.nodes import executable
+from spinning_top_sim.streams import parameters
 
 DESCRIPTION = """\
 Simulate the heavy symmetric top in real time as a ROS 2 node.
@@ -49,8 +50,7 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], Any]]:
             for_ros += ['-r', f'__ns:=/{arguments.namespace.strip("/")}']
         name = executable.node_name(for_ros)
         given = scene_file.given(arguments, name)
-        of_ros = scene_file.given(arguments, name, to_ros=True)
-        for_ros = [*(word for name, value in of_ros.items()
+        for_ros = [*(word for name, value in given.items() if parameters.is_of_ros(name)
                      for word in ('-p', f'{name}:={json.dumps(value)}')), *for_ros]
         argv = ['--ros-args', *for_ros]
     from spinning_top_sim.nodes.node import Simulator  # noqa: PLC0415

@@ -18,6 +18,8 @@ from spinning_top_sim.streams.parameter import ANY, Effect, Parameter, Range
 
 FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')      # each the parent of the next one
 REMOVED = ('pacing', 'max_error', 'publish_clock')      # in logs of 1.x
+# Those that rclpy declares for every node, and the group that it declares for publishers.
+OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -71,12 +73,19 @@ def valid(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checked_changes(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return these values, each checked alone.  Raises ValueError."""
+    """Return these values, each checked alone, without those of ROS.  Raises ValueError."""
+    found = {}
     for name, value in values.items():
-        if name not in BY_NAME and name not in REMOVED:
+        if name in BY_NAME:
+            found[name] = BY_NAME[name].check(value)
+        elif name not in REMOVED and not is_of_ros(name):
             raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
-    return {name: BY_NAME[name].check(value) for name, value in values.items()
-            if name not in REMOVED}
+    return found
+
+
+def is_of_ros(name: str) -> bool:
+    """Return whether rclpy declares a parameter of this name."""
+    return name.partition('.')[0] in OF_ROS
 
 
 def _check_together(values: Mapping[str, Any]) -> None:

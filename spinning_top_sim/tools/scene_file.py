@@ -5,7 +5,7 @@ import argparse
 import difflib
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -19,9 +19,6 @@ from spinning_top_sim.tools import cli
 
 KINDS = {'scene': 'top and start of a scene', 'imu': 'errors of an IMU'}
 NODE = '/spinning_top'      # the full name of the node where no other is asked for
-# Parameters that rclpy declares for every node, and those that it declares for publishers.
-OF_RCLPY = 'use_sim_time', 'start_type_description_service'
-ROS_PARAMETERS = (*OF_RCLPY, 'qos_overrides')
 # What most people need comes first in lists.
 MOST_USED = ('top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'initial.theta',
              'spin.l3', 'spin.lz', 'solver.method', 'duration', 'time_scale', 'seed',
@@ -97,15 +94,13 @@ def default_text(name: str) -> object:
     return 'unset' if default is None else list(default) if isinstance(default, tuple) else default
 
 
-def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = False,
-          ) -> dict[str, object]:
+def given(arguments: argparse.Namespace, node: str = NODE) -> dict[str, object]:
     """
     Return the parameters that these options give to a node, each checked; the last value holds.
 
     A namespace is also the prefix of all frames but the world: several tops share one TF tree.
 
     node : its full name
-    to_ros : those that rclpy declares for every node, such as use_sim_time, instead of the others
 
     Raises as `read_scene`.
     """
@@ -113,16 +108,14 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     named = [file_of(kind, name) for kind in KINDS
              if (name := getattr(arguments, kind)) is not None]
     for path in (*named, *arguments.params):
-        values |= read_scene(path, node, to_ros=to_ros)
-    values |= {name: value for name, value in map(parse_assignment, arguments.param)
-               if is_of_ros(name) == to_ros}
+        values |= read_scene(path, node)
+    values |= map(parse_assignment, arguments.param)
     namespace = (getattr(arguments, 'namespace', None) or '').strip('/')
-    if namespace and not to_ros:
-        for name in parameters.FRAMES[1:]:
-            frame = str(values.get(name, parameters.BY_NAME[name].default))
-            # With a prefix, what is no name of a frame would look like one.
-            if frame and not frame.startswith('/'):
-                values[name] = f'{namespace}/{frame}'
+    for name in parameters.FRAMES[1:] if namespace else ():
+        frame = str(values.get(name, parameters.BY_NAME[name].default))
+        # With a prefix, what is no name of a frame would look like one.
+        if frame and not frame.startswith('/'):
+            values[name] = f'{namespace}/{frame}'
     return values
 
 
@@ -158,34 +151,38 @@ def scene(name: str) -> tuple[Top, State]:
     return parameters.top_of(values), parameters.start_state(values)
 
 
-def read_scene(path: str | Path, node: str = NODE, *, to_ros: bool = False) -> dict[str, object]:
+def read_scene(path: str | Path, node: str = NODE) -> dict[str, object]:
     """
     Return the parameters of a node in a ROS 2 parameter file, each checked.
 
     Sections are matched as by rcl: `/**`, `/left/*`, `left: spinning_top:`.  A section
     `spinning_top` or with the last part of the node's name applies in any namespace.
 
-    node, to_ros : as for `given`
+    node : its full name
 
     Raises OSError, or ValueError, which names the file.
     """
-    sections = list(_sections(parse_yaml(Path(path).read_bytes(), str(path))))
-    if not any(_fits(name, node) for name, _ in sections):
+    found, sections = {}, []
+    for keys, value in _leaves(parse_yaml(Path(path).read_bytes(), str(path))):
+        if 'ros__parameters' in keys[:-1]:
+            at = keys.index('ros__parameters')
+            sections.append(f'/{"/".join(keys[:at])}'.replace('//', '/'))
+            if _fits(sections[-1], node):
+                found['.'.join(keys[at + 1:])] = value
+    if not found:
         raise ValueError(f"{path} has no parameters for the node {node}: it must have '/**:' or "
                          "'spinning_top:', and 'ros__parameters:' in it; its nodes: "
-                         f'{", ".join(name for name, _ in sections) or "none"}')
-    return {parameter: value for name, section in sections if _fits(name, node)
-            for parameter, value in parse_section(section, str(path), to_ros=to_ros).items()}
+                         f'{", ".join(dict.fromkeys(sections)) or "none"}')
+    return parse_section(found, str(path))
 
 
-def _sections(content: object, name: str = '') -> Iterator[tuple[str, Mapping[object, object]]]:
-    """Yield the names of nodes, which may have wildcards, and their parameters."""
-    for key, below in content.items() if isinstance(content, Mapping) else ():
-        if isinstance(below, Mapping):
-            if key == 'ros__parameters':
-                yield name, below
-            else:
-                yield from _sections(below, f'{name}/{key}'.replace('//', '/'))
+def _leaves(content: object, *keys: str) -> Iterator[tuple[Sequence[str], object]]:
+    """Yield the keys that lead to each value in nested mappings, and the value."""
+    if isinstance(content, Mapping):
+        for key, below in content.items():
+            yield from _leaves(below, *keys, str(key))
+    else:
+        yield keys, content
 
 
 def _fits(section: str, node: str) -> bool:
@@ -195,12 +192,11 @@ def _fits(section: str, node: str) -> bool:
             or section in (NODE, f'/{node.rpartition("/")[2]}'))
 
 
-def parse_section(section: Mapping[object, object], source: str, *, to_ros: bool = False,
-                  ) -> dict[str, object]:
-    """Return the parameters in a mapping, each checked.  Raises ValueError, as `read_scene`."""
+def parse_section(section: object, source: str) -> dict[str, object]:
+    """Return the parameters in nested mappings, each checked.  Raises as `read_scene`."""
     try:
-        return {name: _checked(name, value) for name, value in _flatten(section)
-                if is_of_ros(name) == to_ros}
+        return {name: _checked(name, value) for name, value in (
+            ('.'.join(keys), value) for keys, value in _leaves(section))}
     except ValueError as error:
         raise ValueError(f'{source}: {error}') from None
 
@@ -218,7 +214,7 @@ def _checked(name: str, value: object) -> object:
     if value is None or (isinstance(value, list) and len(set(map(type, value))) > 1):
         raise ValueError(f'{name} = {shown(value)}: must be a value, or a list of values of one '
                          'type, such as [0.0, 1.5]')
-    if is_of_ros(name):
+    if parameters.is_of_ros(name):
         return value
     if name not in parameters.BY_NAME:
         raise ValueError(f'there is no parameter {name}{likely_name(name)}')
@@ -231,19 +227,6 @@ def parse_yaml(text: str | bytes, source: str) -> object:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f'{source} is not YAML: {" ".join(str(error).split())}') from error
-
-
-def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    for name, value in section.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}', value
-
-
-def is_of_ros(name: str) -> bool:
-    """Return whether rclpy declares a parameter of this name."""
-    return name.partition('.')[0] in ROS_PARAMETERS
 
 
 def likely_name(name: str, known: Iterable[str] = parameters.BY_NAME, prefix: str = '') -> str:
