@@ -15,7 +15,11 @@ def new_file(path: str | Path, mode: str = 'x', *, partial: bool = False) -> Ite
     partial : after another exception than OSError, keep what is written, such as the first rows
         of a table
     """
-    file = open(path, mode, encoding=None if 'b' in mode else 'utf-8')  # noqa: SIM115
+    try:
+        file = open(path, mode, encoding=None if 'b' in mode else 'utf-8')  # noqa: SIM115
+    except FileExistsError as error:
+        raise FileExistsError(error.errno, f'{error.strerror}, and nothing is overwritten: choose '
+                              'a new name', str(path)) from None
     try:
         with file:
             yield file

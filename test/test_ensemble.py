@@ -12,6 +12,7 @@ import yaml  # type: ignore[import-untyped]
 from helpers import simulations
 from helpers.reference import ROOT
 
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.ensemble import connect, main
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
@@ -52,10 +53,10 @@ def contents(folder):
             for path in folder.rglob('*') if path.is_file()}
 
 
-def parts_of(specification, folder):
+def computed(specification, parts, folder):
     """Compute all parts without Dask; none of their runs fails."""
     folder.mkdir()
-    for rows in specification.parts():
+    for rows in parts:
         assert ensemble_runs.compute_part(specification, folder, rows) == {}
     return folder
 
@@ -79,14 +80,14 @@ def whole(tmp_path_factory):
     """Return the data of the ensemble, computed without Dask, and its specification."""
     folder = tmp_path_factory.mktemp('ensemble')
     path = written(folder)
-    return parts_of(ensemble_runs.read(path), folder / 'data'), path
+    return computed(*ensemble_runs.read(path), folder / 'data'), path
 
 
 def test_every_stream_has_columns(tmp_path):
-    specification = specified(tmp_path, runs=1, duration=0.1, streams=[*ensemble_runs.STREAMS],
-                              sample={'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}})
-    (part,) = specification.parts()
-    row = ensemble_runs.table_of_run(specification, *part).to_pylist()[0]
+    specification, ((run,),) = specified(
+        tmp_path, runs=1, duration=0.1, streams=[*ensemble_runs.STREAMS],
+        sample={'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}})
+    row = ensemble_runs.table_of_run(specification, run).to_pylist()[0]
     assert row['joint_states.position.nutation_joint'] == pytest.approx(np.radians(30.0))
     assert row['~/invariants.data.l3'] == 1.6
     assert row['imu.lever_arm'] == [0.1, 0.0, 0.0]
@@ -99,8 +100,9 @@ def test_every_stream_has_columns(tmp_path):
 def test_a_run_has_the_samples_that_simulate_sends(whole):
     """Also where the IMU loses samples, and sends some twice."""
     (folder, path), run = whole, 7
-    specification = ensemble_runs.read(path)
-    values = specification.values(specification.parts()[run][0])
+    specification, parts = ensemble_runs.read(path)
+    own = {name: value for name, value in parts[run][0].items() if '.' in name or name == 'seed'}
+    values = parameters.checked({**specification.sets[run // 2 % 3], **own})
     every = parquet.read_table(folder)
     rows = every.filter(every['run'].to_numpy() == run)
     assert values['imu.rate'] == [100.0, 200.0][run % 2]
@@ -173,13 +175,14 @@ def test_failed_runs_are_told_with_their_reason(
 
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(tmp_path):
     lists = {'initial.theta': {'values': [0.1, 0.2]}}
-    one = specified(tmp_path, runs=300, seed=3, sample={'spin.l3': {'uniform': [1, 3]}, **lists})
-    more = specified(tmp_path, runs=2030, seed=3, sample={
+    _, one = specified(
+        tmp_path, runs=300, seed=3, sample={'spin.l3': {'uniform': [1, 3]}, **lists})
+    _, more = specified(tmp_path, runs=2030, seed=3, sample={
         'top.mass': {'log_uniform': [0.1, 10.0]}, 'spin.l3': {'uniform': [1.0, 3.0]},
-        'spin.lz': {'normal': [2.0, 0.5]}, **lists, 'imu.rate': {'values': [10, 20, 30]}}).parts()
+        'spin.lz': {'normal': [2.0, 0.5]}, **lists, 'imu.rate': {'values': [10, 20, 30]}})
     drawn = [row for part in more for row in part]
     assert [row['run'] for row in drawn] == [*range(2030)] and len(more) == 51
-    for part in one.parts():
+    for part in one:
         for row in part:
             assert row.items() <= drawn[row['run']].items()
     columns = {name: np.array([row[name] for row in drawn]) for name in drawn[0]}
@@ -198,13 +201,13 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
 def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_path):
     """A magnetometer in one IMU, an outage; a value unset in some runs."""
     sets = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
-    specification = specified(
+    specification, parts = specified(
         tmp_path, runs=6, duration=0.3, streams=['imu', 'mag', 'gnss'], sample={
             'params': {'values': [*sets, {'gnss.outages': [0.05, 0.15]}]},
             'spin.lz': {'values': [None, 1.4]}})
-    runs = [ensemble_runs.table_of_run(specification, *part) for part in specification.parts()]
+    runs = [ensemble_runs.table_of_run(specification, *part) for part in parts]
     whole, joined = parquet.read_table(
-        parts_of(specification, tmp_path / 'data')), pa.concat_tables(runs)
+        computed(specification, parts, tmp_path / 'data')), pa.concat_tables(runs)
     assert whole.schema.equals(joined.schema)
     assert repr(whole.to_pydict()) == repr(joined.to_pydict())      # with the same NaN
     mag = [one['imu/mag.magnetic_field.x'] for one in runs]

@@ -139,11 +139,11 @@ def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
 def test_of_a_part_of_an_ensemble(tmp_path):
     ensemble_runs = pytest.importorskip('spinning_top_sim.tools.ensemble_runs')
     (tmp_path / 'spec.yaml').write_text('{runs: 1, duration: 0.1, streams: [pose]}')
-    specification = ensemble_runs.read(tmp_path / 'spec.yaml')
+    specification, parts = ensemble_runs.read(tmp_path / 'spec.yaml')
 
     def computed(folder):
         folder.mkdir(exist_ok=True)
-        return ensemble_runs.compute_part(specification, folder, *specification.parts())
+        return ensemble_runs.compute_part(specification, folder, *parts)
 
     def content(folder):
         return [path.read_bytes() for path in folder.glob('part-*')]

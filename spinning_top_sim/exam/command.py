@@ -78,7 +78,7 @@ def _run(arguments: argparse.Namespace) -> int:
         with needed('a page', 'plot'):
             from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
     judge = _judge(kind, getattr(arguments, kind))
-    with cli.handling(_interrupt), cli.progress('examined', 100.0, '%') as bar:
+    with cli.progress('examined', 100.0, '%') as bar:
         if kind != 'log':
             options['show'] = lambda done, total: bar(100.0 * done / total)
         report = judge(**options)
@@ -132,11 +132,6 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
         exam = examine if data is None else partial(examine_data, folder=data)
         return exam(make_filter, subject=name, feed=how, **options)
     return judge
-
-
-def _interrupt(*_: object) -> None:
-    """End the exam, and what it has started, at SIGTERM as at SIGINT."""
-    raise KeyboardInterrupt
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:

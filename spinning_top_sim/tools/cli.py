@@ -7,10 +7,9 @@ import io
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import version
@@ -45,28 +44,16 @@ def run(name: str, help_text: str | None,
     parser = Parser(name, help_text)
     add_arguments(parser)
     arguments = parser.parse_args(argv)
+    with contextlib.suppress(ValueError):       # not in the main thread
+        signal.signal(signal.SIGTERM, signal.default_int_handler)       # as at Ctrl-C
     try:
         return command(arguments)
     except (ValueError, RuntimeError, ArithmeticError, OSError, ImportError) as error:
         print_line(f'{parser.prog}: {text_of(error)}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
-    except KeyboardInterrupt as interrupt:
-        what = f'; {interrupt}' if interrupt.args else ''
-        print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
+    except KeyboardInterrupt:
+        print_line(f'{parser.prog}: interrupted', sys.stderr)
         return INTERRUPTED
-
-
-@contextlib.contextmanager
-def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
-    """Call `handler` at SIGINT and SIGTERM; outside of the main thread nothing can."""
-    numbers = (signal.SIGINT, signal.SIGTERM) if (
-        threading.current_thread() is threading.main_thread()) else ()
-    before = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, former in before.items():
-            signal.signal(number, former)
 
 
 @contextlib.contextmanager

@@ -26,7 +26,6 @@ import platform
 import signal
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -71,11 +70,11 @@ def _run(arguments: argparse.Namespace) -> int:
         import distributed  # noqa: PLC0415
 
         from spinning_top_sim.tools import ensemble_runs  # noqa: PLC0415
-    specification = ensemble_runs.read(arguments.specification)
-    folder, runs = arguments.output.absolute(), specification.runs
+    specification, parts = ensemble_runs.read(arguments.specification)
+    folder, runs = arguments.output.absolute(), sum(map(len, parts))
     # The bytes of a dataset depend on these versions, too.
     manifest, text = folder / 'manifest.json', json.dumps({
-        'specification': asdict(specification), 'versions': {
+        'specification': specification._asdict(), 'versions': {
             'python': platform.python_version(), 'machine': platform.machine(),
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}},
         indent=1)
@@ -90,7 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
         manifest.write_text(text, 'utf-8')
         # If a worker is killed, another one computes its task again.
         tasks = client.map(partial(ensemble_runs.compute_part, specification, data),
-                           specification.parts(), pure=False)
+                           parts, pure=False)
         try:
             for done, part in enumerate(distributed.as_completed(tasks, loop=client.loop), 1):
                 failed.update(part.result())

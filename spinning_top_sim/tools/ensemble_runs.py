@@ -8,11 +8,12 @@ A file gets its name when it is whole.  One that is there already is not compute
 import contextlib
 import json
 import math
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -28,13 +29,13 @@ from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools.scene_file import likely_name, parse_section, parse_yaml, read_scene
 
-Row = Mapping[str, Any]         # what a run has of its own: its number, seed, sampled parameters
+# What a run has of its own: its number `run`, its `seed`, and the sampled parameters.
+Row = Mapping[str, Any]
 EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 FAILED_KEY = b'failed'          # of the metadata of a file: why runs failed, by run
 # A part has so much simulated time [s] at most, or one run; more takes more memory and is no
 # faster.  A large ensemble has at least so many parts.
 PART_S, LEAST_PARTS = 250.0, 50
-VALUES, PARAMS, SAMPLE = 'values', 'params', 'sample'
 # Streams that a table can have; only a log has the others.
 STREAMS = tuple(name for name in parameters.STREAMS if name not in ('clock', 'markers'))
 ENTRIES = (
@@ -42,7 +43,7 @@ ENTRIES = (
     replace(parameters.BY_NAME['duration'], range=Range(1e-9, parameters.LONGEST)),
     Parameter('streams', '', choices=STREAMS, default=tuple(
         name for name in STREAMS if parameters.BY_NAME[f'{name}.enabled'].default)))
-# By name, the function that draws n numbers by two others.  Raises ValueError or OverflowError.
+# By name, the function that draws n numbers by two others.
 DISTRIBUTIONS: Mapping[str, Callable[..., Any]] = {
     'uniform': np.random.Generator.uniform, 'normal': np.random.Generator.normal,
     'log_uniform': lambda random, low, high, n: np.exp(
@@ -55,118 +56,94 @@ LABELS: Mapping[str, Sequence[str]] = {
                     ('latitude', 'longitude', 'altitude'))}
 
 
-@dataclass(frozen=True)
-class Specification:
+class Specification(NamedTuple):
     """
-    What the runs of an ensemble are.
+    What the runs of an ensemble share.
 
-    runs, seed : number of runs, and the seed of all random numbers
-    duration : of a run [s]
+    content : of the file
     streams : names of those that the table has
-    sets : parameters; which set a run has is sampled by its number, as `params`
-    sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
+    sets : parameters; the entry `params` of a run is the number of one
     """
 
-    runs: int
-    seed: int
-    duration: float
+    content: Mapping[str, Any]
     streams: Sequence[str]
     sets: Sequence[Mapping[str, Any]]
-    sample: Mapping[str, Mapping[str, Sequence[Any]]]
-
-    def parts(self) -> list[list[Row]]:
-        """
-        Return the runs that one task computes each, and that share a file.
-
-        What is drawn for a name depends on neither the other names nor the number of runs.  Lists
-        of values span a grid, again and again, in which the first list changes fastest.
-        """
-        runs, size = range(self.runs), 1
-        columns = {'run': runs, 'seed': self._random('seed').integers(
-            2 ** 63, size=self.runs).tolist()}
-        for name, rule in self.sample.items():
-            (kind, items), = rule.items()
-            if kind == VALUES:
-                columns[name] = [items[run // size % len(items)] for run in runs]
-                size *= len(items)
-            else:
-                columns[name] = DISTRIBUTIONS[kind](self._random(name), *items, self.runs).tolist()
-        rows: list[Row] = [{name: column[run] for name, column in columns.items()} for run in runs]
-        count = max(1, min(int(PART_S / self.duration), self.runs // LEAST_PARTS))
-        return [rows[first:first + count] for first in range(0, self.runs, count)]
-
-    def _random(self, name: str) -> np.random.Generator:
-        return np.random.default_rng((self.seed, *name.encode()))
-
-    def values(self, row: Row) -> dict[str, Any]:
-        """Return the checked parameters of a run.  Raises ValueError."""
-        own = {name: value for name, value in row.items() if name not in ('run', PARAMS)}
-        return parameters.checked(
-            {**self.sets[row.get(PARAMS, 0)], 'duration': self.duration, **own})
 
 
-def read(path: Path) -> Specification:
+def read(path: Path) -> tuple[Specification, Sequence[Sequence[Row]]]:
     """
-    Return the specification in a YAML file; paths in it are relative to its folder.
+    Return the specification in a YAML file, and its runs, in parts that share a file.
+
+    Paths of parameter files are relative to the folder of the specification.
+    What is drawn for a name depends on neither the other names nor the number of runs.  Lists of
+    values span a grid, again and again, in which the first list changes fastest.
 
     Raises OSError, or ValueError, which names the file, the value and what is allowed.
     """
     content = parse_yaml(path.read_bytes(), str(path))
-    known = {*(entry.name for entry in ENTRIES), PARAMS, SAMPLE}
+    known = [*(entry.name for entry in ENTRIES), 'params', 'sample']
     try:
-        if not (isinstance(content, Mapping) and {'runs', 'duration'} <= content.keys() <= known
-                and isinstance(content.get(PARAMS, []), list)
-                and isinstance(content.get(SAMPLE, {}), Mapping)):
+        if not (isinstance(content, Mapping) and {'runs', 'duration'} <= content.keys() <= {*known}
+                and isinstance(content.get('params', []), list)
+                and isinstance(content.get('sample', {}), Mapping)):
             raise ValueError(f'{shown(content)}: must be a mapping with runs and duration, of '
-                             f'{", ".join(sorted(known))}; params a list, sample a mapping')
-        common, sets = dict[str, Any](), [dict[str, Any]()]
-        for one in content.get(PARAMS, []):
-            common |= _parameter_set(path.parent, one)
-        sample = {name: _rule(name, rule, path.parent)
-                  for name, rule in content.get(SAMPLE, {}).items()}
-        if PARAMS in sample:
-            sets = sample[PARAMS][VALUES]
-            sample[PARAMS] = {VALUES: [*range(len(sets))]}
-        return Specification(
-            **{entry.name: entry.check(content.get(entry.name, entry.default))
-               for entry in ENTRIES}, sets=[{**common, **one} for one in sets], sample=sample)
+                             f'{", ".join(known)}; params a list, sample a mapping')
+        runs, seed, duration, streams = (entry.check(content.get(entry.name, entry.default))
+                                         for entry in ENTRIES)
+        common = [_parameter_set(path.parent, one) for one in content.get('params', [])]
+        columns = {'run': range(runs),
+                   'seed': _random(seed, 'seed').integers(2 ** 63, size=runs).tolist()}
+        chosen, size = [{}], 1
+        for name, rule in content.get('sample', {}).items():
+            kind, items = _rule(name, rule, path.parent)
+            if kind in DISTRIBUTIONS:
+                columns[name] = DISTRIBUTIONS[kind](_random(seed, name), *items, runs).tolist()
+                continue
+            if name == 'params':
+                chosen, items = items, range(len(items))
+            columns[name] = [items[run // size % len(items)] for run in range(runs)]
+            size *= len(items)
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from error
+    rows = [{name: column[run] for name, column in columns.items()} for run in range(runs)]
+    count = max(1, min(int(PART_S / duration), runs // LEAST_PARTS))
+    sets = [dict(ChainMap({'duration': duration}, one, *reversed(common))) for one in chosen]
+    return Specification(content, streams, sets), [
+        rows[first:first + count] for first in range(0, runs, count)]
+
+
+def _random(seed: int, name: str) -> np.random.Generator:
+    return np.random.default_rng((seed, *name.encode()))
 
 
 def _parameter_set(folder: Path, given: object) -> dict[str, Any]:
     if isinstance(given, Mapping):
-        return parse_section(given, PARAMS)
+        return parse_section(given, 'params')
     if isinstance(given, str):
         return read_scene(folder / given)
     raise ValueError(f'params: {shown(given)}: must be a parameter file, or parameters and their '
                      'values')
 
 
-def _rule(name: str, rule: object, folder: Path) -> dict[str, list[Any]]:
-    """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
-    if name not in (PARAMS, *parameters.BY_NAME):
+def _rule(name: str, rule: Any, folder: Path) -> tuple[str, Sequence[Any]]:
+    """Return how a parameter is sampled, checked: `values` and a list, or a distribution."""
+    if name not in ('params', *parameters.BY_NAME):
         raise ValueError(f'sample: there is no parameter {name}{likely_name(name)}')
-    check = partial(_parameter_set, folder) if name == PARAMS else parameters.BY_NAME[name].check
-    refusal = ValueError(
-        f'sample: {name} = {shown(rule)}: must be values with a list, uniform with [low, high], '
-        'log_uniform with such above 0, or normal with [mean, deviation]')
-    if not (isinstance(rule, Mapping) and len(rule) == 1 and rule.keys() <= {
-            VALUES, *DISTRIBUTIONS}):
-        raise refusal
-    (kind, items), = rule.items()
-    if not isinstance(items, list) or not items:
-        raise refusal
-    if kind == VALUES:
-        return {kind: [*map(check, items)]}
+    check = partial(_parameter_set, folder) if name == 'params' else parameters.BY_NAME[name].check
     try:
-        low, high = map(float, items)
-        DISTRIBUTIONS[kind](np.random.default_rng(0), low, high, 1)
-    except (TypeError, ValueError, OverflowError):
-        raise refusal from None
-    for bound in items[:1] if kind == 'normal' else items:
-        check(bound)
-    return {kind: [low, high]}
+        (kind, items), = rule.items()
+        if not isinstance(items, list) or not items:
+            raise TypeError
+        if kind != 'values':
+            low, high = map(float, items)
+            DISTRIBUTIONS[kind](np.random.default_rng(0), low, high, 1)
+    except (AttributeError, LookupError, OverflowError, TypeError, ValueError):
+        raise ValueError(
+            f'sample: {name} = {shown(rule)}: must be values with a list, uniform with [low, high]'
+            ', log_uniform with such above 0, or normal with [mean, deviation]') from None
+    # Both bounds, but no deviation.
+    checked = [*map(check, items[:1] if kind == 'normal' else items)]
+    return kind, checked if kind == 'values' else (low, high)
 
 
 def _column_names(channel: Channel) -> list[str]:
@@ -187,7 +164,8 @@ def table_of_run(specification: Specification, row: Row) -> pa.Table:
     have the same columns.  Raises ValueError for parameters that are not allowed, and
     IntegrationError if the motion ends early.
     """
-    values = specification.values(row)
+    own = {name: value for name, value in row.items() if name not in ('run', 'params')}
+    values = parameters.checked({**specification.sets[row.get('params', 0)], **own})
     simulation = Simulation(values, EPOCH_NS)
     # Times and messages of each channel, block by block.
     sent = {channel: ([np.empty(0, np.int64)], [np.empty((0, len(channel.template)), np.uint8)])

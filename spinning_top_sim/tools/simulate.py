@@ -14,13 +14,13 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from spinning_top_sim.recording.provenance import environment, run_metadata
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import McapWriter
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
@@ -33,8 +33,8 @@ from spinning_top_sim.tools import cli, scene_file
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
-# Time [ns], and L3 and Lz commanded there [kg m^2/s], None at the end of the run.
-Stop = tuple[int, tuple[float, float] | None]
+# Time [ns], and the command there: l3 and lz [kg m^2/s], or nothing at the end of the run.
+Stop = tuple[int, dict[str, float]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,12 +76,45 @@ def _run(arguments: argparse.Namespace) -> int:
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
-            summary = write_log(output, simulation, stops, show, arguments.namespace)
+            summary = _write_log(output, simulation, stops, show, arguments.namespace)
         else:
             summary = ', '.join(_write_table(output, file_format, simulation, stops, show))
     if not arguments.quiet:
         cli.print_line(f'{output}: {summary}')
     return cli.OK
+
+
+def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
+    """Return the commands (T:L3:LZ) in the order of their application, and the end of the run."""
+    stops: list[Stop] = []
+    for text in commands:
+        try:
+            t, l3, lz = map(float, text.split(':'))
+            at_ns, *_ = map(round, (t * NANOSECONDS, l3, lz))       # round refuses inf and nan
+        except (ValueError, OverflowError):
+            raise ValueError(f'--command {text}: must be T:L3:LZ, three numbers') from None
+        if not 0 <= at_ns <= duration_ns:
+            raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
+                             f'{duration_ns / NANOSECONDS:g} s')
+        stops.append((at_ns, {'l3': l3, 'lz': lz}))
+    # The sort is stable: commands at the same time keep their order.
+    return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, {})]
+
+
+def _play(simulation: Simulation, channels: Sequence[Channel], stops: Sequence[Stop],
+          show: Callable[[float], object]) -> Iterator[Block | Event]:
+    """Yield the blocks up to each stop, and its command, which RuntimeError refuses."""
+    for stop_ns, momenta in stops:
+        for block in simulation.play(channels, stop_ns):
+            yield block
+            show(simulation.sent_ns / NANOSECONDS)
+        if momenta:
+            try:
+                yield simulation.apply('command', **momenta)
+            except ValueError as error:
+                numbers = ':'.join(map(repr, (stop_ns / NANOSECONDS, *momenta.values())))
+                raise RuntimeError(f'--command {numbers}: {error}; the file holds the run up to '
+                                   'there') from error
 
 
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
@@ -100,51 +133,9 @@ def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Se
     return units
 
 
-def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
-    """Return the commands (T:L3:LZ) in the order of their application, and the end of the run."""
-    stops: list[Stop] = []
-    for text in commands:
-        try:
-            t, l3, lz = map(float, text.split(':'))
-            at_ns, *_ = map(round, (t * NANOSECONDS, l3, lz))       # round refuses inf and nan
-        except (ValueError, OverflowError):
-            raise ValueError(f'--command {text}: must be T:L3:LZ, three numbers') from None
-        if not 0 <= at_ns <= duration_ns:
-            raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
-                             f'{duration_ns / NANOSECONDS:g} s')
-        stops.append((at_ns, (l3, lz)))
-    # The sort is stable: commands at the same time keep their order.
-    return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
-
-
-def _play(simulation: Simulation, channels: Sequence[Channel], stops: Sequence[Stop],
-          show: Callable[[float], object]) -> Iterator[Block | Event]:
-    """
-    Yield the blocks up to each stop, then its command, which has been applied.
-
-    Raises IntegrationError where the state cannot take a command.
-    """
-    for stop_ns, momenta in stops:
-        for block in simulation.play(channels, stop_ns):
-            yield block
-            show(simulation.sent_ns / NANOSECONDS)
-        if momenta is not None:
-            l3, lz = momenta
-            try:
-                yield simulation.apply('command', l3=l3, lz=lz)
-            except ValueError as error:
-                t = stop_ns / NANOSECONDS
-                raise IntegrationError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds '
-                                       f'the run up to t = {t!r} s', reached_ns=stop_ns) from error
-
-
-def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
-              show: Callable[[float], object], namespace: str) -> str:
-    """
-    Simulate a run into a new log; return the number of messages and the size of the file.
-
-    After an error the log is closed and readable, and holds what was computed before.
-    """
+def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
+               show: Callable[[float], object], namespace: str) -> str:
+    """Write a log, which is whole after an error, too; return what is in it."""
     values, epoch_ns = simulation.values_at_start, simulation.epoch_ns
     channels = recorded(simulation.channels, values)
     types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
@@ -154,23 +145,15 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                for name, type_name in types.items()],
         {**run_metadata(values, epoch_ns, -1, (), values), **environment()},
         compression=values['record.compression'])
-
-    def add(event: Event) -> None:
-        for topic, data in event.entries():
-            file.add(*single(topics.index(topic), epoch_ns + event.t_ns, data))
-
     try:
-        add(Event('start', 0, -1))
-        for done in _play(simulation, channels, stops, show):
+        for done in chain([Event('start', 0, -1)], _play(simulation, channels, stops, show)):
             if isinstance(done, Block):
                 for channel, t_ns, rows in done.messages:
                     file.add(channels.index(channel), epoch_ns + t_ns, rows)
                 file.flush()
             else:
-                add(done)
-    except KeyboardInterrupt as interrupt:
-        raise KeyboardInterrupt(f'{path} holds the run up to t = '
-                                f'{simulation.sent_ns / NANOSECONDS:g} s') from interrupt
+                for topic, data in done.entries():
+                    file.add(*single(topics.index(topic), epoch_ns + done.t_ns, data))
     finally:
         file.finish()
     return f'{file.message_counts.total()} messages, {file.size / 1e6:.1f} MB'

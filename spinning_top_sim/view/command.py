@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import threading
@@ -101,9 +102,8 @@ def _show(arguments: argparse.Namespace) -> int:
         source = simulation.OwnSimulation(_open_page(arguments, 'spinning top'), scene, values)
     try:
         if arguments.html is None:
-            stopped = threading.Event()
-            with cli.handling(lambda *_: stopped.set()):
-                source.page.show(source, stopped)
+            with contextlib.suppress(KeyboardInterrupt):        # its usual end
+                source.page.show(source, threading.Event())
         else:
             cli.print_line(f'{arguments.html}: ' + player.write_file(
                 arguments.html, source.page, source.player, source.track))
