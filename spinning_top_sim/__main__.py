@@ -2,6 +2,7 @@
 """The command `spinning-top`, which is `python -m spinning_top_sim` as well."""
 
 import argparse
+import io
 import os
 import signal
 import sys
@@ -33,8 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:        # not where it is ignored
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-    from spinning_top_sim.tools.cli import print_any_text  # noqa: PLC0415
-    print_any_text()
+    for stream in (sys.stdout, sys.stderr):     # they escape what their encoding lacks
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
     try:
         name = _parser().parse_args(argv[:1]).command
         if name != 'examine':       # where filters of the user run

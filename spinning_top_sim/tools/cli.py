@@ -3,7 +3,6 @@
 
 import argparse
 import contextlib
-import io
 import os
 import signal
 import sys
@@ -67,13 +66,6 @@ def reader_may_end(ignored: type[OSError] = BrokenPipeError,
             stream.flush()
     except ignored:         # Python flushes the output again
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def print_any_text() -> None:
-    """Let the standard streams escape what their encoding lacks, instead of raising an error."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors='backslashreplace')
 
 
 def check_output(*paths: Path | None) -> None:

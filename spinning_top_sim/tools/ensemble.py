@@ -29,13 +29,10 @@ from collections.abc import Iterator
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from spinning_top_sim.installation import needed, version
 from spinning_top_sim.tools import cli
-
-if TYPE_CHECKING:
-    import distributed
 
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
 CONFIGURATION = {
@@ -82,7 +79,7 @@ def _run(arguments: argparse.Namespace) -> int:
             manifest.is_file() and manifest.read_text('utf-8') == text):
         raise ValueError(f'{folder}: it has other files, another ensemble, or one of other '
                          'versions: choose a new folder')
-    data, failed = folder / 'data', dict[str, str]()
+    data, failed = folder / 'data', list[list[Any]]()
     with (cli.progress('computed', runs, 'runs', quiet=arguments.quiet) as show,
           connect(arguments.workers, arguments.scheduler) as client):
         data.mkdir(parents=True, exist_ok=True)
@@ -92,7 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
                            parts, pure=False)
         try:
             for done, part in enumerate(distributed.as_completed(tasks, loop=client.loop), 1):
-                failed.update(part.result())
+                failed += part.result()
                 show(runs * done / len(tasks))
         except (distributed.KilledWorker, distributed.comm.CommClosedError,
                 concurrent.futures.CancelledError, asyncio.CancelledError) as error:
@@ -100,9 +97,9 @@ def _run(arguments: argparse.Namespace) -> int:
                                f'{error}') from error
     for path in data.glob('.*'):                # of a worker that was killed
         path.unlink()
-    failed = dict(sorted(failed.items(), key=lambda item: int(item[0])))
-    (folder / 'failed.json').write_text(json.dumps(failed, indent=1), 'utf-8')
-    for run, reason in [*failed.items()][:1]:
+    failed.sort()
+    (folder / 'failed.json').write_text(json.dumps(dict(failed), indent=1), 'utf-8')
+    for run, reason in failed[:1]:
         cli.print_line(f'spinning-top ensemble: {len(failed)} of {runs} runs failed, see '
                        f'failed.json; run {run}: {reason}', sys.stderr)
     if not arguments.quiet:
@@ -111,13 +108,11 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def connect(workers: int | None, scheduler: str | None) -> Iterator['distributed.Client']:
+def connect(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     """
-    Yield a client of the cluster at the address `scheduler`, else of processes on this machine.
+    Yield the client of a Dask cluster: at an address, or of workers on this machine.
 
-    workers : number of processes on this machine, None for one a core
-
-    Raises OSError if the cluster cannot be reached, or has no workers.
+    Raises OSError if it cannot be reached, or has no workers.
     """
     import dask  # noqa: PLC0415
     import distributed  # noqa: PLC0415
@@ -126,17 +121,17 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator['distributed
         handler.setLevel(logging.CRITICAL)          # errors are raised by the client
     local = {} if scheduler else {**LOCAL, 'n_workers': workers}
     resource_tracker.ensure_running()       # if it started later, it would unblock SIGINT
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(CONFIGURATION))
+    with dask.config.set(CONFIGURATION):
         # A terminal sends Ctrl-C to the workers, too, but only this process reacts.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            client = stack.enter_context(distributed.Client(
-                scheduler, timeout=CONNECT_S, set_as_default=False, **local))
+            client = distributed.Client(
+                scheduler, timeout=CONNECT_S, set_as_default=False, **local)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        client.wait_for_workers(1, FIRST_WORKER_S)
-        yield client
+        with client:
+            client.wait_for_workers(1, FIRST_WORKER_S)
+            yield client
 
 
 main = partial(cli.run, 'ensemble', __doc__, add_arguments, _run)

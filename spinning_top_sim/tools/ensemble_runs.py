@@ -8,7 +8,6 @@ A file gets its name when it is whole.  One that is there already is not compute
 import contextlib
 import json
 import math
-from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,10 +30,8 @@ from spinning_top_sim.tools.scene_file import likely_name, parse_section, parse_
 
 # What a run has of its own: its number `run`, its `seed`, and the sampled parameters.
 Row = Mapping[str, Any]
-EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
-FAILED_KEY = b'failed'          # of the metadata of a file: why runs failed, by run
-# A part has so much simulated time [s] at most, or one run; more takes more memory and is no
-# faster.  A large ensemble has at least so many parts.
+FAILED_KEY = b'failed'          # of the metadata of a file: runs that failed, and why
+# A part has so much simulated time [s] at most, or one run; a large ensemble has so many parts.
 PART_S, LEAST_PARTS = 250.0, 50
 # Streams that a table can have; only a log has the others.
 STREAMS = tuple(name for name in parameters.STREAMS if name not in ('clock', 'markers'))
@@ -43,8 +40,8 @@ ENTRIES = (
     replace(parameters.BY_NAME['duration'], range=Range(1e-9, parameters.LONGEST)),
     Parameter('streams', '', choices=STREAMS, default=tuple(
         name for name in STREAMS if parameters.BY_NAME[f'{name}.enabled'].default)))
-# By name, the function that draws n numbers by two others.
-DISTRIBUTIONS: Mapping[str, Callable[..., Any]] = {
+Draws = Callable[..., Any]      # draws n numbers by two others
+DISTRIBUTIONS: Mapping[str, Draws] = {
     'uniform': np.random.Generator.uniform, 'normal': np.random.Generator.normal,
     'log_uniform': lambda random, low, high, n: np.exp(
         random.uniform(math.log(low), math.log(high), n))}
@@ -83,37 +80,38 @@ def read(path: Path) -> tuple[Specification, Sequence[Sequence[Row]]]:
     content = parse_yaml(path.read_bytes(), str(path))
     known = [*(entry.name for entry in ENTRIES), 'params', 'sample']
     try:
-        if not (isinstance(content, Mapping) and {'runs', 'duration'} <= content.keys() <= {*known}
-                and isinstance(content.get('params', []), list)
-                and isinstance(content.get('sample', {}), Mapping)):
+        if not isinstance(content, Mapping) or not {'runs', 'duration'} <= content.keys() <= {
+                *known}:
             raise ValueError(f'{shown(content)}: must be a mapping with runs and duration, of '
-                             f'{", ".join(known)}; params a list, sample a mapping')
+                             f'{", ".join(known)}')
+        params, sample = content.get('params', []), content.get('sample', {})
+        if not isinstance(params, list) or not isinstance(sample, Mapping):
+            raise ValueError('params must be a list, sample a mapping')
         runs, seed, duration, streams = (entry.check(content.get(entry.name, entry.default))
                                          for entry in ENTRIES)
-        common = [_parameter_set(path.parent, one) for one in content.get('params', [])]
-        columns = {'run': range(runs),
-                   'seed': _random(seed, 'seed').integers(2 ** 63, size=runs).tolist()}
-        chosen, size = [{}], 1
-        for name, rule in content.get('sample', {}).items():
-            kind, items = _rule(name, rule, path.parent)
-            if kind in DISTRIBUTIONS:
-                columns[name] = DISTRIBUTIONS[kind](_random(seed, name), *items, runs).tolist()
-                continue
-            if name == 'params':
-                chosen, items = items, range(len(items))
-            columns[name] = [items[run // size % len(items)] for run in range(runs)]
-            size *= len(items)
+        common = {name: value for one in params
+                  for name, value in _parameter_set(path.parent, one).items()}
+        rules: dict[str, tuple[Draws | None, Sequence[Any]]] = {
+            'seed': (np.random.Generator.integers, (0, 2 ** 63)),
+            **{name: _rule(name, rule, path.parent) for name, rule in sample.items()}}
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from error
+    columns: dict[str, Sequence[Any]] = {'run': range(runs)}
+    sets, size = [common], 1
+    for name, (draws, items) in rules.items():
+        if draws:
+            random = np.random.default_rng((seed, *name.encode()))
+            columns[name] = draws(random, *items, runs).tolist()
+            continue
+        indices = [run // size % len(items) for run in range(runs)]
+        columns[name] = [items[index] for index in indices]
+        if name == 'params':
+            sets, columns[name] = [{**common, **one} for one in items], indices
+        size *= len(items)
     rows = [{name: column[run] for name, column in columns.items()} for run in range(runs)]
     count = max(1, min(int(PART_S / duration), runs // LEAST_PARTS))
-    sets = [dict(ChainMap({'duration': duration}, one, *reversed(common))) for one in chosen]
-    return Specification(content, streams, sets), [
+    return Specification(content, streams, [{**one, 'duration': duration} for one in sets]), [
         rows[first:first + count] for first in range(0, runs, count)]
-
-
-def _random(seed: int, name: str) -> np.random.Generator:
-    return np.random.default_rng((seed, *name.encode()))
 
 
 def _parameter_set(folder: Path, given: object) -> dict[str, Any]:
@@ -125,8 +123,8 @@ def _parameter_set(folder: Path, given: object) -> dict[str, Any]:
                      'values')
 
 
-def _rule(name: str, rule: Any, folder: Path) -> tuple[str, Sequence[Any]]:
-    """Return how a parameter is sampled, checked: `values` and a list, or a distribution."""
+def _rule(name: str, rule: Any, folder: Path) -> tuple[Draws | None, Sequence[Any]]:
+    """Return how a parameter is sampled, checked: a distribution of two numbers, or a list."""
     if name not in ('params', *parameters.BY_NAME):
         raise ValueError(f'sample: there is no parameter {name}{likely_name(name)}')
     check = partial(_parameter_set, folder) if name == 'params' else parameters.BY_NAME[name].check
@@ -141,9 +139,8 @@ def _rule(name: str, rule: Any, folder: Path) -> tuple[str, Sequence[Any]]:
         raise ValueError(
             f'sample: {name} = {shown(rule)}: must be values with a list, uniform with [low, high]'
             ', log_uniform with such above 0, or normal with [mean, deviation]') from None
-    # Both bounds, but no deviation.
     checked = [*map(check, items[:1] if kind == 'normal' else items)]
-    return kind, checked if kind == 'values' else (low, high)
+    return (None, checked) if kind == 'values' else (DISTRIBUTIONS[kind], (low, high))
 
 
 def _column_names(channel: Channel) -> list[str]:
@@ -166,7 +163,7 @@ def table_of_run(specification: Specification, row: Row) -> pa.Table:
     """
     own = {name: value for name, value in row.items() if name not in ('run', 'params')}
     values = parameters.checked({**specification.sets[row.get('params', 0)], **own})
-    simulation = Simulation(values, EPOCH_NS)
+    simulation = Simulation(values, NANOSECONDS)        # the default epoch of `simulate`
     # Times and messages of each channel, block by block.
     sent = {channel: ([np.empty(0, np.int64)], [np.empty((0, len(channel.template)), np.uint8)])
             for channel in simulation.channels if channel.name in specification.streams}
@@ -194,21 +191,17 @@ def table_of_run(specification: Specification, row: Row) -> pa.Table:
 
 
 def compute_part(specification: Specification, folder: Path, rows: Sequence[Row],
-                 ) -> dict[str, str]:
-    """
-    Compute the file of some runs if it is missing; return why runs of it failed, by run.
-
-    Raises OSError.
-    """
+                 ) -> list[list[Any]]:
+    """Compute a missing file of runs; return the runs that fail, and why.  Raises OSError."""
     path = folder / f'part-{rows[0]["run"]:08d}.parquet'
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
-        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED_KEY]))
-    tables, failed = [], {}
+        return list(json.loads(parquet.read_metadata(path).metadata[FAILED_KEY]))
+    tables, failed = [], []
     for row in rows:
         try:
             tables.append(table_of_run(specification, row))
         except Exception as error:
-            failed[str(row['run'])] = f'{reason_of(error)}; it has {row}'
+            failed.append([row['run'], f'{reason_of(error)}; it has {row}'])
     if tables:
         table = pa.concat_tables(tables).combine_chunks().replace_schema_metadata(
             {FAILED_KEY: json.dumps(failed)})

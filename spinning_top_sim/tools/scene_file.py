@@ -13,7 +13,6 @@ from typing import Any, NoReturn
 import yaml
 
 from spinning_top_sim.installation import parameter_files
-from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli
 
@@ -26,24 +25,18 @@ MOST_USED = ('top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'init
 
 
 class _Loader(yaml.SafeLoader):
-    """As rcl: 1e5 is a double, 1_000 and ~ are strings, and there are no aliases."""
+    """Finds the types that rcl finds: 1e5 is a double, 1_000 and ~ are strings."""
 
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise ValueError('rcl supports no aliases')
-        return super().compose_node(parent, index)
+    bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
+    yaml_implicit_resolvers: Mapping[str, Any] = {}
 
 
-_Loader.bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
-_Loader.yaml_implicit_resolvers = {}
 for _type, _pattern in (
-        ('null', r''),
-        ('bool', r'[yY]|yes|Yes|YES|[nN]|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|'
-                 r'off|Off|OFF'),
-        ('int', r'[-+]?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)'),
-        ('float', r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|'
-                  r'[-+]?\.?(inf|Inf|INF)|\.?(nan|NaN|NAN)')):
-    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
+        ('null', ''), ('bool', 'y|yes|n|no|true|false|on|off'),
+        ('int', r'[-+]?(0x[0-9a-f]+|0[0-7]*|[1-9][0-9]*)'),
+        ('float', r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?|[-+]?\.?inf|\.?nan')):
+    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}',
+                                  re.compile(f'({_pattern})$', re.IGNORECASE), None)
 
 
 def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
@@ -57,15 +50,14 @@ def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
 
 def _name(kind: str, text: str) -> str:
     """Return the text; "help" prints the names of the installed files and exits, as --help."""
-    if text != 'help':
-        return text
-    with cli.reader_may_end():
+    if text == 'help':
         for stem, path in parameter_files(kind).items():
             # The first sentence of the comment at the head, behind the licence.
             head = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
                             if line.startswith('# '))
-            print(f'{stem:20} {head.partition(". ")[0].rstrip(".")}')
-    raise SystemExit(cli.OK)
+            cli.print_line(f'{stem:20} {head.partition(". ")[0].rstrip(".")}')
+        raise SystemExit(cli.OK)
+    return text
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:
@@ -81,10 +73,10 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 
 class _ListParameters(argparse.Action):
     def __call__(self, *_: object) -> NoReturn:
-        with cli.reader_may_end():
-            for name in dict.fromkeys((*MOST_USED, *parameters.BY_NAME)):
-                print(f'{name}  (default {default_text(name)})', textwrap.indent(
-                    textwrap.fill(parameters.BY_NAME[name].describe(), 74), 6 * ' '), sep='\n')
+        for name in dict.fromkeys((*MOST_USED, *parameters.BY_NAME)):
+            cli.print_line(f'{name}  (default {default_text(name)})')
+            for line in textwrap.wrap(parameters.BY_NAME[name].describe(), 74):
+                cli.print_line(f'      {line}')
         raise SystemExit(cli.OK)
 
 
@@ -126,29 +118,6 @@ def file_of(kind: str, name: str) -> Path:
         raise ValueError(f'{kind} {name}: must be the path of a file, or one of '
                          f'{", ".join(files)}{likely_name(name, files)}')
     return files.get(name, Path(name))
-
-
-def scene(name: str) -> tuple[Top, State]:
-    """
-    Return the top and the start of a scene, for `solve`.
-
-    Parameters
-    ----------
-    name : str
-        Of a scene that is installed, such as 'looping', or the path of a parameter file.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    ValueError
-        For a name that is not known, a wrong file, or a scene whose pivot moves.
-    """
-    values = parameters.checked(read_scene(file_of('scene', str(name))))
-    if parameters.pivot_path(values) is not None:
-        raise ValueError(f'scene {name}: its pivot moves, which `solve` does not know; '
-                         f'see spinning-top simulate --scene {name}')
-    return parameters.top_of(values), parameters.start_state(values)
 
 
 def read_scene(path: str | Path, node: str = NODE) -> dict[str, object]:
@@ -195,8 +164,7 @@ def _fits(section: str, node: str) -> bool:
 def parse_section(section: object, source: str) -> dict[str, object]:
     """Return the parameters in nested mappings, each checked.  Raises as `read_scene`."""
     try:
-        return {name: _checked(name, value) for name, value in (
-            ('.'.join(keys), value) for keys, value in _leaves(section))}
+        return dict(_checked('.'.join(keys), value) for keys, value in _leaves(section))
     except ValueError as error:
         raise ValueError(f'{source}: {error}') from None
 
@@ -206,19 +174,16 @@ def parse_assignment(text: str) -> tuple[str, object]:
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    return name, _checked(name, parse_yaml(yaml_text, text))
+    return _checked(name, parse_yaml(yaml_text, text))
 
 
-def _checked(name: str, value: object) -> object:
-    """Return the value of a parameter, checked unless rclpy declares it.  Raises ValueError."""
-    if value is None or (isinstance(value, list) and len(set(map(type, value))) > 1):
-        raise ValueError(f'{name} = {shown(value)}: must be a value, or a list of values of one '
-                         'type, such as [0.0, 1.5]')
+def _checked(name: str, value: object) -> tuple[str, object]:
+    """Return a parameter, checked unless rclpy declares it.  Raises ValueError."""
     if parameters.is_of_ros(name):
-        return value
+        return name, value
     if name not in parameters.BY_NAME:
         raise ValueError(f'there is no parameter {name}{likely_name(name)}')
-    return parameters.BY_NAME[name].check(value)
+    return name, parameters.BY_NAME[name].check(value)
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:

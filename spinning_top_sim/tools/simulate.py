@@ -11,10 +11,10 @@ exit codes:
 """
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 
 from spinning_top_sim.recording.provenance import environment, run_metadata
@@ -31,21 +31,21 @@ from spinning_top_sim.table import RIDE_UNITS, UNITS, columns, write_csv, write_
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, period_ns
 from spinning_top_sim.tools import cli, scene_file
 
-FORMATS = ('mcap', 'csv', 'parquet')
-
-# Time [ns], and the command there: l3 and lz [kg m^2/s], or nothing at the end of the run.
-Stop = tuple[int, dict[str, float]]
+TABLES = {'.csv': write_csv, '.parquet': write_parquet}
+# Time [ns], text and momenta [kg m^2/s] of a command; the last one is the end of the run.
+Stop = tuple[int, str, dict[str, float]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
     scene_file.add_parameters(parser)
-    add('--duration', type=float, metavar='S',
-        help='simulated time [s]; default: the parameter duration')
+    add('--duration', metavar='S', type='duration:={}'.format, dest='param', action='append',
+        help='simulated time [s]: the parameter duration')
     add('-o', '--output', metavar='FILE', required=True, type=Path,
         help='file to write, .mcap, .csv or .parquet; an existing one is never overwritten')
-    add('--seed', type=int, help='seed of the noise; default: the parameter seed')
+    add('--seed', type='seed:={}'.format, dest='param', action='append',
+        help='seed of the noise: the parameter seed')
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
@@ -57,28 +57,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output
-    file_format = output.suffix[1:]
-    if file_format not in FORMATS:
-        raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}')
+    if output.suffix not in ('.mcap', *TABLES):
+        raise ValueError(f'{output}: the name must end in .mcap, {", ".join(TABLES)}')
     epoch_ns = arguments.epoch * NANOSECONDS
     if not 0.0 <= epoch_ns <= LAST_STAMP_NS:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
-    given = scene_file.given(arguments, resolve_topic('spinning_top', arguments.namespace))
-    given |= {name: value for name in ('seed', 'duration')
-              if (value := getattr(arguments, name)) is not None}
-    values = parameters.checked(given)
+    values = parameters.checked(scene_file.given(
+        arguments, resolve_topic('spinning_top', arguments.namespace)))
     if not values['duration'] > 0.0:
         raise ValueError('--duration S, or the parameter duration, must be given')
     simulation = Simulation(values, round(epoch_ns))
-    if objection := simulation.trajectory.top.objection:
-        cli.print_line(f'spinning-top simulate: warning: {objection}', sys.stderr)
     cli.check_output(output)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
-        if file_format == 'mcap':
-            summary = _write_log(output, simulation, stops, show, arguments.namespace)
-        else:
-            summary = ', '.join(_write_table(output, file_format, simulation, stops, show))
+        write = _write_log if output.suffix == '.mcap' else _write_table
+        summary = write(arguments, simulation, stops, show)
     if not arguments.quiet:
         cli.print_line(f'{output}: {summary}')
     return cli.OK
@@ -96,64 +89,63 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
         if not 0 <= at_ns <= duration_ns:
             raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
                              f'{duration_ns / NANOSECONDS:g} s')
-        stops.append((at_ns, {'l3': l3, 'lz': lz}))
+        stops.append((at_ns, text, {'l3': l3, 'lz': lz}))
     # The sort is stable: commands at the same time keep their order.
-    return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, {})]
+    return [*sorted(stops, key=itemgetter(0)), (duration_ns, '', {})]
 
 
 def _play(simulation: Simulation, channels: Sequence[Channel], stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[Block | Event]:
-    """Yield the blocks up to each stop, and its command, which RuntimeError refuses."""
-    for stop_ns, momenta in stops:
+    """Yield the blocks up to each stop, and its command; a RuntimeError refuses it."""
+    for stop_ns, text, momenta in stops:
         for block in simulation.play(channels, stop_ns):
             yield block
             show(simulation.sent_ns / NANOSECONDS)
-        if momenta:
+        if text:
             try:
                 yield simulation.apply('command', **momenta)
             except ValueError as error:
-                numbers = ':'.join(map(repr, (stop_ns / NANOSECONDS, *momenta.values())))
-                raise RuntimeError(f'--command {numbers}: {error}; the file holds the run up to '
+                raise RuntimeError(f'--command {text}: {error}; the file holds the run up to '
                                    'there') from error
 
 
-def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
-                 show: Callable[[float], object]) -> Mapping[str, str]:
-    """Write a table; return the units of its columns."""
+def _write_table(arguments: argparse.Namespace, simulation: Simulation, stops: Sequence[Stop],
+                 show: Callable[[float], object]) -> str:
+    """Write a table; return the names of its columns."""
     pivot_moves = simulation.trajectory.pivot is not None
     units = RIDE_UNITS if pivot_moves else UNITS
     row = Template(Field('row', len(units)))
     table = Channel('table', '', '', period_ns(simulation.values_at_start['pose.rate']), row,
                     lambda samples: [columns(samples.t_ns / NANOSECONDS, samples.states,
                                              pivot_moves=pivot_moves)])
-    write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
-    write(path, (row.decode(rows)[0] for done in _play(simulation, [table], stops, show)
-                 if isinstance(done, Block) for _, _, rows in done.messages), units)
-    return units
+    TABLES[arguments.output.suffix](arguments.output, (
+        row.decode(rows)[0] for done in _play(simulation, [table], stops, show)
+        if isinstance(done, Block) for _, _, rows in done.messages), units)
+    return ', '.join(units)
 
 
-def _write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
-               show: Callable[[float], object], namespace: str) -> str:
+def _write_log(arguments: argparse.Namespace, simulation: Simulation, stops: Sequence[Stop],
+               show: Callable[[float], object]) -> str:
     """Write a log, which is whole after an error, too; return what is in it."""
     values, epoch_ns = simulation.values_at_start, simulation.epoch_ns
     channels = recorded(simulation.channels, values)
     types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
-    topics = list(types)
+    topics = [*types]
     file = McapWriter(
-        path, [RecordedTopic(resolve_topic(name, namespace), type_name)
-               for name, type_name in types.items()],
+        arguments.output, [RecordedTopic(resolve_topic(name, arguments.namespace), type_name)
+                           for name, type_name in types.items()],
         {**run_metadata(values, epoch_ns, -1, (), values), **environment()},
         compression=values['record.compression'])
     try:
         for done in chain([Event('start', 0, -1)], _play(simulation, channels, stops, show)):
-            if isinstance(done, Block):
-                for channel, t_ns, rows in done.messages:
-                    file.add(channels.index(channel), epoch_ns + t_ns, rows)
-                file.flush()
-            else:
+            if isinstance(done, Event):
                 for topic, data in done.entries():
                     file.add(*single(topics.index(topic), epoch_ns + done.t_ns, data))
+            else:
+                for channel, t_ns, rows in done.messages:
+                    file.add(topics.index(channel.topic), epoch_ns + t_ns, rows)
+                file.flush()
     finally:
         file.finish()
     return f'{file.message_counts.total()} messages, {file.size / 1e6:.1f} MB'
