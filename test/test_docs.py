@@ -122,26 +122,23 @@ class Runner:
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 assert [main(words[1:]) for words in commands] == [0] * len(commands), block
             return out.getvalue()
-        process = subprocess.Popen(
-            ['bash', '-euo', 'pipefail', '-c', block.text], stdin=subprocess.DEVNULL, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
-            env=self._environment)
-        if block.mark == 'background':          # ended as by Ctrl-C
-            self.running.callback(ended, process, signal.SIGINT)
+        line = ['bash', '-euo', 'pipefail', '-c', block.text]
+        if block.mark == 'background':
+            self.running.callback(_ended, subprocess.Popen(
+                line, stdin=subprocess.DEVNULL, start_new_session=True, env=self._environment))
             return None
-        with contextlib.ExitStack() as stack:
-            stack.callback(ended, process, signal.SIGKILL)
-            said, _ = process.communicate(timeout=TIMEOUT)
+        done = subprocess.run(line, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, check=False,
+                              stderr=subprocess.STDOUT, text=True, timeout=TIMEOUT,
+                              env=self._environment)
         expected = block.mark.removeprefix('exit code ') or '0'
-        assert str(process.returncode) == expected, f'{self._name}:{block.line}: {said}'
-        return said
+        assert str(done.returncode) == expected, f'{self._name}:{block.line}: {done.stdout}'
+        return done.stdout
 
 
-def ended(process, number):
-    """Signal the group of a process, and wait for its end."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, number)
-    process.communicate(timeout=TIMEOUT)
+def _ended(process):
+    """End a group of processes as Ctrl-C does."""
+    os.killpg(process.pid, signal.SIGINT)
+    process.wait(TIMEOUT)
 
 
 @pytest.mark.parametrize('page', [page for page in PAGES if any(

@@ -285,7 +285,8 @@ def test_what_cannot_be_written_is_named_and_nothing_is_overwritten(tmp_path, lo
     head.write_bytes(log.content[:log.chunks[0][1]])
     none = tmp_path / 'none'
     for output in (path, head, none / 'whole.mcap'):
-        reason = 'No such file or directory' if output.parent == none else 'File exists'
+        reason = 'No such file or directory' if output.parent == none else (
+            'File exists, and nothing is overwritten: choose a new name')
         assert run(path, '-o', output) == (
             FAILED, '', f'spinning-top recover: cannot write {output}: {reason}\n')
     assert run(head) == (FAILED, '', f'spinning-top recover: nothing to save in {head}: there is '
