@@ -74,13 +74,10 @@ def valid(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def checked_changes(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return these values, each checked alone, without those of ROS.  Raises ValueError."""
-    found = {}
     for name, value in values.items():
-        if name in BY_NAME:
-            found[name] = BY_NAME[name].check(value)
-        elif name not in REMOVED and not is_of_ros(name):
+        if not (name in BY_NAME or name in REMOVED or is_of_ros(name)):
             raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
-    return found
+    return {name: BY_NAME[name].check(value) for name, value in values.items() if name in BY_NAME}
 
 
 def is_of_ros(name: str) -> bool:
@@ -91,10 +88,9 @@ def is_of_ros(name: str) -> bool:
 def _check_together(values: Mapping[str, Any]) -> None:
     """Raise ValueError for values that are wrong only together."""
     def need(allowed: bool, name: str, text: str) -> None:
-        value = values[name]
         if not allowed:
-            raise ValueError(
-                f'{name} = {list(value) if isinstance(value, tuple) else value!r}: {text}')
+            value = list(values[name]) if isinstance(values[name], tuple) else values[name]
+            raise ValueError(f'{name} = {value!r}: {text}')
 
     frames = [values[name] for name in FRAMES]
     for name, frame in zip(FRAMES, frames, strict=True):
@@ -115,8 +111,7 @@ def _check_together(values: Mapping[str, Any]) -> None:
         need(is_profile or not any(profile), name,
              'must be two or more ascending frequencies > 0, each with a density > 0')
     for name in ('mag.disturbance.world', 'mag.disturbance.body'):
-        times = values[name]
-        for begin, end in zip(times[::5], times[1::5], strict=True):
+        for begin, end in zip(values[name][::5], values[name][1::5], strict=True):
             need(begin <= end, name,
                  f'an event from {begin!r} to {end!r} s: must not end before it begins')
     latitude, longitude, _ = values['gnss.origin']
