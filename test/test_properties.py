@@ -59,6 +59,7 @@ CONTENT = st.recursive(
 @given(YAML | CONTENT.map(lambda content: yaml.dump({'/**': {'ros__parameters': content}},
                                                     allow_unicode=True)))
 @example(f'/**: {{ros__parameters: {{imu.rpy: [1.0, {1 << 15_000:#x}]}}}}')
+@example('/**: &a {b: *a}')
 def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
     path = tmp_path / 'scene.yaml'
     path.write_bytes(text.encode(errors='surrogatepass'))

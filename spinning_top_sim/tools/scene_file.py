@@ -6,7 +6,7 @@ import difflib
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -29,6 +29,7 @@ class _Loader(yaml.SafeLoader):
 
     bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
     yaml_implicit_resolvers: Mapping[str, Any] = {}
+    construct_object = partialmethod(yaml.SafeLoader.construct_object, deep=True)   # no recursion
 
 
 for _type, _pattern in (

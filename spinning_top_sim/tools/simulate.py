@@ -44,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='simulated time [s]: the parameter duration')
     add('-o', '--output', metavar='FILE', required=True, type=Path,
         help='file to write, .mcap, .csv or .parquet; an existing one is never overwritten')
-    add('--seed', type='seed:={}'.format, dest='param', action='append',
-        help='seed of the noise: the parameter seed')
+    add('--seed', metavar='N', type='seed:={}'.format, dest='param', action='append',
+        help='of the noise: the parameter seed')
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
         'applied in the order given')
