@@ -110,6 +110,8 @@ def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(
     path.write_text('spinning_top:\n  ros__parameters:\n    top.mass: 5\n')
     for node in ('/spinning_top', '/left/spinning_top', '/left/another_name'):
         assert read_scene(path, node) == {'top.mass': 5.0}
+    path.write_text('another_name: {ros__parameters: {top.mass: 5, use_sim_time: true}}')
+    assert parameters.checked(read_scene(path, '/left/another_name'))['top.mass'] == 5.0
     path.write_text('/left/other: {ros__parameters: {a: 1}}\nb: {c: {ros__parameters: {a: 1}}}')
     with pytest.raises(ValueError, match=r'for the node /a/spinning_top: .* nodes: /left/other, '
                        '/b/c'):

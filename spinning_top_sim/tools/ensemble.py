@@ -88,8 +88,8 @@ def _run(arguments: argparse.Namespace) -> int:
         tasks = client.map(partial(ensemble_runs.compute_part, specification, data),
                            parts, pure=False)
         try:
-            for done, part in enumerate(distributed.as_completed(tasks, loop=client.loop), 1):
-                failed += part.result()
+            for done, task in enumerate(tasks, 1):
+                failed += task.result()
                 show(runs * done / len(tasks))
         except (distributed.KilledWorker, distributed.comm.CommClosedError,
                 concurrent.futures.CancelledError, asyncio.CancelledError) as error:
@@ -97,7 +97,6 @@ def _run(arguments: argparse.Namespace) -> int:
                                f'{error}') from error
     for path in data.glob('.*'):                # of a worker that was killed
         path.unlink()
-    failed.sort()
     (folder / 'failed.json').write_text(json.dumps(dict(failed), indent=1), 'utf-8')
     for run, reason in failed[:1]:
         cli.print_line(f'spinning-top ensemble: {len(failed)} of {runs} runs failed, see '
