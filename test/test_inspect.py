@@ -20,7 +20,7 @@ from helpers.simulations import SECOND
 from mcap.writer import Writer
 
 from spinning_top_sim.streams.events import Event
-from spinning_top_sim.tools import inspect, recover, simulate
+from spinning_top_sim.tools import inspect
 
 # The tilt rests, or nearly: there is no nutation in the data.
 RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
@@ -100,16 +100,11 @@ def test_the_longest_gap_of_a_topic_is_told(short, tmp_path, capsys):
     assert joints['rate'] == pytest.approx(100.0)
 
 
-def test_text_tells_the_numbers_and_help_fits_into_80_columns(stepped, capsys):
+def test_text_tells_the_numbers(stepped, capsys):
     text = told(capsys, stepped)[1]
     assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
     assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
     assert re.search(r'nutation_period +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d\n', text)
-    assert 'journal: 3 commands, 0 resets' in text
-    for tool in (inspect, recover, simulate):
-        with pytest.raises(SystemExit):
-            tool.main(['--help'])
-        assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
 def test_json_is_strict_and_documented(short, capsys):
@@ -148,7 +143,7 @@ def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_
     assert out.replace('\n', '').isprintable()
     assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
     code, _, err = told(capsys, path, '--verify')
-    assert code == 1 and err.startswith('spinning-top inspect: --verify: it was not recorded by')
+    assert code == 1 and err.startswith('spinning-top inspect: it was not recorded by')
     code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
 
@@ -181,30 +176,15 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
-def test_a_plot_of_many_nutations_is_of_the_first_and_says_so(stepped, tmp_path, capsys,
-                                                              monkeypatch):
+def test_a_plot_of_many_motions_is_of_the_first_and_says_so(stepped, tmp_path, capsys,
+                                                            monkeypatch):
     pytest.importorskip('matplotlib')
-    content, titles = as_json(capsys, stepped)[1], []
-    for most in (40, 4):
-        monkeypatch.setattr(inspect, 'MOST_NUTATIONS', most)
-        assert told(capsys, stepped, '--plot', tmp_path / f'{most}.svg')[0] == 0
-        *_, title = re.findall('<!-- (.*) -->', (tmp_path / f'{most}.svg').read_text())
-        titles.append(title)
-    assert titles[0] == 'stepped.mcap: 3 of 4 motions'
-    end, = re.findall(r'3 of 4 motions, up to (.*) s of 3 s', titles[1])
-    end_ns = content['motions'][0]['begin_ns'] + float(end) * SECOND
-    nutations = sum(max(0.0, min(end_ns, one['end_ns']) - one['begin_ns'])
-                    / one['exact']['nutation_period'] / SECOND for one in content['motions'])
-    assert nutations == pytest.approx(4.5, abs=0.5)
-
-
-def test_samples_that_are_far_apart_are_drawn(tmp_path, capsys, monkeypatch):
-    pytest.importorskip('matplotlib')
-    pytest.importorskip('PIL.Image')
-    monkeypatch.setattr(inspect, 'LONGEST_S', 0.1)
-    log = log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', 'record.streams:=[pose]',
-                 '-p', 'pose.rate:=2.0')
-    assert told(capsys, log, '--animate', tmp_path / 'top.gif')[0] == 0
+    for seconds, title in ((20.0, '4 motions, up to 3 s of 3 s'),
+                           (0.5, '4 motions, up to 0.51 s of 3 s')):
+        monkeypatch.setattr(inspect, 'PLOTTED_S', seconds)
+        path = tmp_path / f'{seconds}.svg'
+        assert told(capsys, stepped, '--plot', path)[0] == 0
+        assert re.findall('<!-- stepped.mcap: . of (.*) -->', path.read_text()) == [title]
 
 
 @pytest.mark.parametrize('options', [
@@ -227,7 +207,7 @@ def test_without_a_reader_of_the_output_all_is_done_and_the_code_is_kept(short, 
                             f'--export=euroc_imu:{readings}'], stdout=theirs,
                            stderr=subprocess.PIPE, timeout=60, check=False)
     os.close(theirs)
-    assert (ended.returncode, ended.stderr) == (1, b'') and readings.exists()
+    assert (ended.returncode, ended.stderr.count(b'\n')) == (1, 1) and readings.exists()
 
 
 def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):

@@ -274,7 +274,7 @@ ONE_BY_ONE = 'rosbag2 has compressed its messages one by one'
 def test_what_is_no_log_or_compressed_is_refused(tmp_path, make, reason):
     path = tmp_path / 'run.mcap'
     make(path)
-    code, out, err = run(path)
+    code, out, err = run(path, '-o', tmp_path / 'whole.mcap')
     assert (code, out, err.count('\n')) == (FAILED, '', 1)
     assert err.startswith(f'spinning-top recover: cannot read {path}') and reason in err
 
@@ -288,6 +288,7 @@ def test_what_cannot_be_written_is_named_and_nothing_is_overwritten(tmp_path, lo
         reason = 'No such file or directory' if output.parent == none else 'File exists'
         assert run(path, '-o', output) == (
             FAILED, '', f'spinning-top recover: cannot write {output}: {reason}\n')
-    assert run(head) == (FAILED, '', f'spinning-top recover: nothing to save in {head}: there is '
-                         'no whole message in it\n')
+    assert run(head, '-o', tmp_path / 'whole.mcap') == (
+        FAILED, '', f'spinning-top recover: nothing to save in {head}: there is no whole message '
+        'in it\n')
     assert path.read_bytes() == log.content and len(list(tmp_path.iterdir())) == 2
