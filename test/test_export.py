@@ -10,11 +10,8 @@ from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.tools import inspect
 
-NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
-         'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
-         'imu.accelerometer_random_walk': 1e-4, 'imu.accelerometer_turn_on_bias': 0.1}
-VALUES = {**NOISY, 'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
-          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9]}
+VALUES = {'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
+          'imu.gyroscope_noise_density': 1e-3, 'imu.lever_arm': [0.1, -0.2, 0.3]}
 FILES = {'tum': 'truth.tum', 'euroc_imu': 'imu.csv'}
 
 

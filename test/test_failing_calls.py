@@ -71,33 +71,13 @@ def test_of_a_recording(tmp_path):
     each_failing(act, check)
 
 
-def test_of_a_log_of_simulate(tmp_path):
-    """What was computed before is in the log, or there is none."""
-    def act(name):
-        path = tmp_path / f'{name}.mcap'
-        code, _, said = run('--duration', 0.1, '--command', '0.05:1.7:1.4', '--quiet', '-p',
-                            'record.streams:=[pose]', '-o', path, tool=simulate)
-        return code, path, said
-
-    _, path, _ = act('expected')
-    expected = seen_by_us(path)
-
-    def check(found, failure):
-        code, path, said = found
-        kept = seen_by_us(path) if path.exists() else []
-        if code == 0:
-            assert kept == expected, failure
-            return
-        assert code == (130 if 'Interrupt' in failure else 1), failure
-        assert said.count('\n') == 1 and (code == 130 or path.name in said), (failure, said)
-        assert kept == expected[:len(kept)], failure
-
-    each_failing(act, check, more=[KeyboardInterrupt])
-
-
-@pytest.mark.parametrize('kind', ['recovery', 'tum', 'csv', 'parquet'])
+@pytest.mark.parametrize('kind', ['recovery', 'tum', 'csv', 'parquet', 'mcap'])
 def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
-    """After each failure the command says so in a line that names the file, and leaves none."""
+    """
+    After each failure the command says so in a line that names the file, and leaves none.
+
+    A log of `simulate` keeps what was computed before.
+    """
     if kind == 'parquet':
         pytest.importorskip('pyarrow')
     log = tmp_path / 'run.mcap'
@@ -106,23 +86,24 @@ def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
     if kind == 'recovery':
         log.write_bytes(log.read_bytes()[:-3000])
 
-    def act(path):
-        if kind == 'recovery':
-            return run(log, '-o', path)
-        if kind == 'tum':
-            return run(log, '--export', f'tum:{path}', tool=inspect)
-        return run('--duration', 0.1, '--quiet', '-o', path, tool=simulate)
-
-    expected = tmp_path / f'expected.{kind}'
-    assert act(expected)[0] == 0
-
-    def done(name):
+    def act(name):
         path = tmp_path / f'{name}.{"mcap" if kind == "recovery" else kind}'
-        return path, *act(path)
+        if kind == 'recovery':
+            return path, *run(log, '-o', path)
+        if kind == 'tum':
+            return path, *run(log, '--export', f'tum:{path}', tool=inspect)
+        return path, *run('--duration', 0.1, '--command', '0.05:1.7:1.4', '--quiet', '-p',
+                          'record.streams:=[pose]', '-o', path, tool=simulate)
+
+    expected, code, *_ = act('expected')
+    assert code == 0
+    messages = seen_by_us(expected) if kind == 'mcap' else []
 
     def check(found, failure):
         path, code, _, said = found
-        is_whole = path.exists() and path.read_bytes() == expected.read_bytes()
+        kept = seen_by_us(path) if kind == 'mcap' and path.exists() else []
+        is_whole = path.exists() and (
+            kept == messages if messages else path.read_bytes() == expected.read_bytes())
         if code == 0:
             assert is_whole, failure
         else:
@@ -131,9 +112,10 @@ def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
             assert said.count('\n') == 1 and (is_interrupted or path.name in said), (failure, said)
             # A failure may come too late to matter.
             assert not path.exists() or is_whole or (
+                kept == messages[:len(kept)] if messages else
                 'unlink' in failure and not path.stat().st_size), failure
 
-    each_failing(done, check, more=[KeyboardInterrupt] if kind == 'recovery' else ())
+    each_failing(act, check, more=[KeyboardInterrupt] if kind in ('recovery', 'mcap') else ())
 
 
 def test_of_a_part_of_an_ensemble(tmp_path):

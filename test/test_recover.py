@@ -267,7 +267,6 @@ ONE_BY_ONE = 'rosbag2 has compressed its messages one by one'
     (os.mkdir, 'a folder must hold one .mcap file, not 0'),
     (lambda path: write_bag(path, split=3), 'a folder must hold one .mcap file, not 3'),
     (lambda path: write_bag(path, 'FILE'), 'it is compressed as a whole, unpack it by zstd -d'),
-    (lambda path: write_bag(path, 'FILE', 'lz4', lz4.frame.compress), 'unpack it by lz4 -d'),
     # The mode is told by a record in the file, or by metadata.yaml beside it.
     (lambda path: write_bag(path, 'MESSAGE'), ONE_BY_ONE),
     (lambda path: write_bag(path, 'MESSAGE', record=False), ONE_BY_ONE)])
