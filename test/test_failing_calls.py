@@ -9,12 +9,13 @@ import errno
 import random
 import resource
 
+import numpy as np
 import pytest
 from helpers.failing_calls import Calls
 from helpers.inspected import log_of
 from helpers.logs import run, seen_by_us
 from helpers.machine import Machine
-from helpers.recordings import METADATA, TOPICS, rows_of
+from helpers.recordings import METADATA, TOPICS, pose_cdr
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
@@ -44,8 +45,9 @@ def test_of_a_recording(tmp_path):
             nonlocal recorder
             recorder = Recorder(str(path), TOPICS, METADATA.copy, max_loss=0.1, min_free_bytes=0,
                                 threads=machine, clock=machine.clock)
-            for number in range(10):
-                recorder.write([rows_of(10 * number, 10 * number + 10)])
+            for stamps in np.arange(100).reshape(10, 10):
+                data = b''.join(map(pose_cdr, stamps))
+                recorder.write([(0, stamps, np.frombuffer(data, np.uint8).reshape(10, -1))])
                 machine.sleep(20_000_000)
             recorder.close()
 
