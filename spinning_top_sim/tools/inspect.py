@@ -177,9 +177,11 @@ def _motion(number: int, motion: Motion, log_ns: int) -> Iterator[str]:
     begin, end = (max(at_ns - log_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))
     exact, measured = vars(motion.exact) if motion.exact else {}, motion.measured or {}
-    rows = [(name, _number(exact.get(name), 12), _number(measured.get(name), 12), _number(
-        measured[name] - exact[name] if measured.get(name) and name in exact else None, 2))
-        for name in dict.fromkeys((*exact, *measured))]
+    rows = []
+    for name in dict.fromkeys((*exact, *measured)):
+        truth, seen = exact.get(name), measured.get(name)
+        apart = seen - truth if isinstance(truth, float) and isinstance(seen, float) else None
+        rows.append((name, _number(truth, 12), _number(seen, 12), _number(apart, 2)))
     rows += [(f'drift of {name}', '', '', _number(drift, 2))
              for name, drift in motion.drifts.items()]
     rows.append(('orientation_error', '', '', _number(motion.orientation_error, 2)))

@@ -204,10 +204,9 @@ def compare(run: RunDescription, reader: LogReader) -> Comparison:
             f'--verify: it was recorded by spinning_top_sim {run.environment["version"]}, which '
             'draws other noise and computes other last bits: verify it with that version')
     topics = [topic for name, topic in run.topics.items() if name != events.EVENTS]
-    there = run.environment
     result = Comparison(dict.fromkeys(topics, 0), warnings=[
-        f'{what} was {there[what]}, is {here}'
-        for what, here in provenance.environment().items() if there[what] != here])
+        f'{what} was {run.environment[what]}, is {here}' for what, here in
+        provenance.environment().items() if run.environment[what] != here])
     # By stamp and topic, of which several commands may have the same: what is in the log, and
     # what was computed, with its template.
     waiting = defaultdict[tuple[int, str], tuple[list[bytes], list[tuple[Template, bytes]]]](

@@ -122,8 +122,7 @@ class Motion:
         if sum(len(stamps_ns) for stamps_ns, _ in parts) < 2:
             return
         stamps_ns, rows = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-        t = (stamps_ns - reader.span[0]) / NANOSECONDS
-        self.states = states = SampledStates(piece.top, t, rows)
+        self.states = states = SampledStates(piece.top, 1e-9 * (stamps_ns - reader.span[0]), rows)
         if piece.rests and not np.isnan(states.l3).all():   # else it has other constants
             self.drifts = {name: _largest(relative_drift(
                 getattr(states, name), getattr(piece, name))) for name in ('energy', 'l3', 'lz')}
