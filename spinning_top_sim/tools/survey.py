@@ -82,7 +82,6 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: Times, fields: tuple[NDArray[np
         rows[RATES] = parts[3] if len(parts) > 2 else np.nan
     norm = np.linalg.norm(rows[QUATERNION], axis=0)
     valid = np.isfinite(norm) & (norm > 0.0)
-    rows[QUATERNION] /= np.where(valid, norm, 1.0)
     return stamps_ns[valid], rows[:, valid]
 
 
