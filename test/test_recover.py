@@ -141,8 +141,6 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
                    for message in reader.messages())
 
 
-# ---------------------------------------------------------------------------- logs of others
-
 HEADER = record_bytes(Header(profile='', library='a stranger'))
 CHANNEL = record_bytes(Channel(id=1, topic='/a', message_encoding='x', metadata={}, schema_id=0))
 
@@ -223,8 +221,6 @@ def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
         kept = seen_by_mcap(output)
         assert kept == messages[:len(kept)] and len(kept) >= sum(end <= size for end in ends)
 
-
-# ----------------------------------------------------------------------------------- hostile
 
 FIRST, SECOND = message(5, b'first'), message(5, b'second' * 50)
 
