@@ -191,7 +191,7 @@ def _motion(number: int, motion: Motion, log_ns: int) -> Iterator[str]:
         ('[s, rad, rad/s]', 'exact', 'measured', 'difference'),
         [row for row in rows if any(row[1:])])
     yield (f'measured from {motion.source}: {measured["nutations"]} whole nutations' if measured
-           else 'not measured: no topic with attitudes, or gaps in it')
+           else 'not measured: fewer than two attitudes, or gaps between them')
     if measured.get('missing'):
         yield f'not measured: {measured["missing"]}'
 
