@@ -151,8 +151,9 @@ def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_
     assert code == 0 and out.count('not recorded by spinning_top_sim') == 1
     assert out.replace('\n', '').isprintable()
     assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
-    code, _, err = told(capsys, path, '--verify')
-    assert code == 1 and err.startswith('spinning-top inspect: it was not recorded by')
+    for option in ('--verify', f'--export=tum:{tmp_path / "a"}'):
+        code, _, err = told(capsys, path, option)
+        assert code == 1 and err.startswith('spinning-top inspect: it was not recorded by')
     code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
 

@@ -89,11 +89,14 @@ def test_each_difference_is_counted_and_the_first_is_told_with_field_stamp_and_v
 def test_the_journal_is_obeyed(short, tmp_path, capsys):
     """A digit of a commanded momentum makes another motion; a rate may change before t = 0."""
     event = Event('parameters', 0, -1, {'pose.rate': 100.0}).as_mapping()
-    for name, change, history in (('same', lambda topic, number, data: data, [event]),
-                                  ('begun', lambda topic, number, data: (     # then killed
-                                      None if '/events' not in topic or number else data), [])):
-        assert verified(capsys, rewritten(short, tmp_path / name, change, {
-            'history': json.dumps(history)}))['identical']
+    with LogReader(short) as reader:
+        values = json.loads(reader.metadata['spinning_top_sim']['parameters'])
+    before = {'history': json.dumps([event]),
+              'parameters': json.dumps({**values, 'pose.rate': 50.0})}
+    for name, change, metadata in (('same', lambda topic, number, data: data, before),
+                                   ('begun', lambda topic, number, data: (     # then killed
+                                       None if '/events' not in topic or number else data), {})):
+        assert verified(capsys, rewritten(short, tmp_path / name, change, metadata))['identical']
     verdict = verified(capsys, rewritten(
         short, tmp_path / 'run.mcap', lambda topic, number, data: (
             data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
