@@ -10,96 +10,44 @@ from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.tools import inspect
 
-NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
-         'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
-         'imu.accelerometer_random_walk': 1e-4, 'imu.accelerometer_turn_on_bias': 0.1}
-VALUES = {**NOISY, 'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
-          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9]}
-FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv'}
-
-
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory):
-    """A log, and what is exported from it."""
-    folder = tmp_path_factory.mktemp('exports')
-    log = log_of(folder / 'run.mcap', '--command', '0.503:2.0:1.5', '--duration', 1, '--epoch',
-                 1700000000, *(text for name, value in VALUES.items()
-                               for text in ('-p', f'{name}:={str(value).lower()}')))
-    assert inspect.main([str(log), *(
-        f'--export={kind}:{folder / name}' for kind, name in FILES.items())]) == 0
-    return folder
-
-
-@pytest.fixture(scope='module')
-def messages(folder):
-    found = {}
-    with AnyReader([folder / 'run.mcap']) as reader:
-        for connection, _, data in reader.messages():
-            found.setdefault(connection.topic, []).append(
-                reader.deserialize(data, connection.msgtype))
-    return found
-
-
-def rows(path, delimiter):
-    with open(path, newline='') as file:
-        return [row for row in csv.reader(file, delimiter=delimiter) if not row[0].startswith('#')]
-
-
-def stamps(messages):
-    return [one.header.stamp.sec * 10 ** 9 + one.header.stamp.nanosec for one in messages]
-
 
 def xyz(vector):
     return [vector.x, vector.y, vector.z]
 
 
-@pytest.mark.parametrize(('name', 'topic', 'numbers_of'), [
-    ('truth.tum', '/ground_truth/imu_odom', lambda one: [
-        *xyz(one.pose.pose.position), *xyz(one.pose.pose.orientation),
-        one.pose.pose.orientation.w]),
-    ('imu.csv', '/imu/data_raw',
-     lambda one: [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)])])
+def pose_in(message):
+    pose = message.pose.pose
+    return [*xyz(pose.position), *xyz(pose.orientation), pose.orientation.w]
+
+
+def readings_in(message):
+    return [*xyz(message.angular_velocity), *xyz(message.linear_acceleration)]
+
+
+@pytest.mark.parametrize(('kind', 'topic', 'numbers_of', 'more'), [
+    ('tum', 'ground_truth/imu_odom', pose_in,
+     ('-p', 'ground_truth_imu_odom.enabled:=true', '-p', 'imu.lever_arm:=[0.1, -0.2, 0.3]')),
+    ('tum', 'ground_truth/odom', pose_in, ()),
+    ('euroc_imu', 'imu/data_raw', readings_in, ('-p', 'imu.gyroscope_noise_density:=1e-3'))])
 def test_numbers_and_stamps_are_those_of_messages_to_the_last_bit(
-        folder, messages, name, topic, numbers_of):
-    found = rows(folder / name, ' ' if 'tum' in name else ',')
-    assert [int(row[0].replace('.', '')) for row in found] == stamps(messages[topic])
-    assert np.array_equal(np.array(found, np.float64)[:, 1:], [*map(numbers_of, messages[topic])])
-
-
-def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(folder, messages):
-    """In the world the velocity is the rate of the position."""
-    found = rows(folder / 'truth.csv', ',')
-    odometry, biases = messages['/ground_truth/imu_odom'], messages['/ground_truth/imu_bias']
-    assert [int(row[0]) for row in found] == stamps(odometry)
-    numbers = np.array(found, np.float64)
-    assert numbers.shape == (126, 17)
-    assert np.array_equal(numbers[:, 1:4], [xyz(one.pose.pose.position) for one in odometry])
-    assert np.array_equal(numbers[:, 4:8], [
-        [one.pose.pose.orientation.w, *xyz(one.pose.pose.orientation)] for one in odometry])
-    # Before the command; central differences of order 4.
-    p = numbers[:60, 1:4]
-    rate = (p[:-4] - 8.0 * p[1:-3] + 8.0 * p[3:-1] - p[4:]) / (12.0 * 0.008)
-    assert np.abs(rate - numbers[2:58, 8:11]).max() <= 2e-4 * np.abs(rate).max()
-    times = stamps(biases)
-    newest = [biases[np.searchsorted(times, stamp, 'right') - 1] for stamp in stamps(odometry)]
-    assert np.array_equal(numbers[:, 11:], [
-        [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)] for one in newest])
-
-
-def test_tum_takes_the_body_where_the_log_has_no_odometry_of_the_imu(tmp_path, capsys):
-    log, path = log_of(tmp_path / 'run.mcap', '--duration', 0.1), tmp_path / 'a'
-    assert inspect.main([str(log), '--export', f'tum:{path}']) == 0
-    assert capsys.readouterr().out.endswith(f'{path}: tum of the body, from ground_truth/odom\n')
+        tmp_path, capsys, kind, topic, numbers_of, more):
+    log, path = log_of(tmp_path / 'run.mcap', '--command', '0.503:2.0:1.5', '--duration', 1,
+                       '--epoch', 1700000000, *more), tmp_path / 'a'
+    assert inspect.main([str(log), '--export', f'{kind}:{path}']) == 0
+    assert capsys.readouterr().err == f'{path}: {kind}, from {topic}\n'
     with AnyReader([log]) as reader:
-        poses = [reader.deserialize(data, connection.msgtype).pose.pose
-                 for connection, _, data in reader.messages()
-                 if connection.topic == '/ground_truth/odom']
-    assert np.array_equal(np.array(rows(path, ' '), np.float64)[:, 1:], [
-        [*xyz(one.position), *xyz(one.orientation), one.orientation.w] for one in poses])
+        messages = [reader.deserialize(data, connection.msgtype)
+                    for connection, _, data in reader.messages()
+                    if connection.topic == f'/{topic}']
+    with open(path, newline='') as file:
+        rows = [row for row in csv.reader(file, delimiter=' ' if kind == 'tum' else ',')
+                if not row[0].startswith('#')]
+    assert [int(row[0].replace('.', '')) for row in rows] == [
+        one.header.stamp.sec * 10 ** 9 + one.header.stamp.nanosec for one in messages]
+    assert np.array_equal(np.array(rows, np.float64)[:, 1:], [*map(numbers_of, messages)])
 
 
 @pytest.mark.parametrize(('kind', 'reason', 'code'), [
-    ('euroc:DIR/a', 'no ground_truth/imu_odom; a run has it with ground_truth_', 2),
     ('euroc_imu:DIR/a', 'no imu/data_raw', 2), ('euroc_imu:DIR/there', 'there: File exists', 1)])
 def test_what_cannot_be_exported_is_told(tmp_path, capsys, kind, reason, code):
     (tmp_path / 'there').write_text('precious')

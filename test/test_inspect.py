@@ -20,7 +20,7 @@ from helpers.simulations import SECOND
 from mcap.writer import Writer
 
 from spinning_top_sim.streams.events import Event
-from spinning_top_sim.tools import inspect, recover, simulate
+from spinning_top_sim.tools import inspect
 
 # The tilt rests, or nearly: there is no nutation in the data.
 RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
@@ -47,14 +47,18 @@ def test_every_scene_is_measured_from_its_data(tmp_path, capsys, scene):
 
 
 def test_a_motion_ends_where_its_stamps_jump(short, tmp_path, capsys):
-    event = Event('epoch', 400_000_000, 400_000_000, {'epoch_ns': 3_000_000_000}).entries()[0][1]
+    """Behind that, a command that the samples do not obey."""
+    jump, command = (event.entries()[0][1] for event in (
+        Event('epoch', 400_000_000, 400_000_000, {'epoch_ns': 3 * SECOND}),
+        Event('command', 450_000_000, 450_000_000, {'l3': 1.0, 'lz': 1.0})))
     path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
-        [data, event] if topic.endswith('/events') and number == 1 else data),
+        [data, jump, command] if topic.endswith('/events') and number == 1 else data),
         stamp=lambda topic, number, stamp_ns: stamp_ns + 2 * SECOND * (
             stamp_ns > 1_400_000_000 or (topic.endswith('/events') and number == 1)))
-    _, content = as_json(capsys, path)
-    assert [motion['cause'] for motion in content['motions']] == ['start', 'command', 'epoch']
-    assert max(motion['orientation_error'] for motion in content['motions']) < 1e-9
+    *motions, last = as_json(capsys, path)[1]['motions']
+    assert [motion['cause'] for motion in motions] == ['start', 'command', 'epoch']
+    assert max(motion['orientation_error'] for motion in motions) < 1e-9
+    assert last['begin_ns'] == motions[-1]['end_ns'] == 3_450_000_000
 
 
 @pytest.mark.parametrize('topic', ['pose', 'ground_truth_imu', 'ground_truth_odom'])
@@ -85,31 +89,31 @@ def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
     *others, last = content['motions']
     assert 1e-6 < last['orientation_error'] < 1e-4
     assert 1e-4 < last['drifts']['l3'] < 1e-3 and last['measured']['nutations'] >= 1
-    for motion in (motion for motion in others if motion['measured']):
+    for motion in (motion for motion in others if motion['drifts']):
         assert motion['orientation_error'] < 1e-9
         assert 0.0 < motion['drifts']['energy'] < 1e-11 and motion['drifts']['l3'] < 1e-13
 
 
-def test_the_longest_gap_of_a_topic_is_told(short, tmp_path, capsys):
+def test_the_longest_gap_of_a_topic_is_told_and_what_has_gaps_is_not_measured(
+        short, tmp_path, capsys):
     path = rewritten(short, tmp_path / 'gap.mcap', lambda topic, number, data: (
-        None if topic == '/pose' and number in (3, *range(10, 20)) else data))
+        None if topic == '/joint_states' and number in (3, *range(10, 20)) else data))
     _, content = as_json(capsys, path)
     pose, joints = (content['topics'][name] for name in ('/pose', '/joint_states'))
-    assert (pose['count'], pose['longest_gap_ns']) == (40, [1_090_000_000, 1_200_000_000])
-    assert np.ptp(joints['longest_gap_ns']) == 10_000_000
-    assert joints['rate'] == pytest.approx(100.0)
+    assert (joints['count'], joints['longest_gap_ns']) == (40, [1_090_000_000, 1_200_000_000])
+    assert (pose['rate'], np.ptp(pose['longest_gap_ns'])) == (pytest.approx(100.0), 10_000_000)
+    first, second = content['motions']
+    assert first['measured'] is None and first['orientation_error'] < 1e-9
+    assert second['measured']['samples'] == 20
 
 
-def test_text_tells_the_numbers_and_help_fits_into_80_columns(stepped, capsys):
+def test_text_tells_the_numbers(stepped, tmp_path, capsys):
+    ride = log_of(tmp_path / 'run.mcap', '--scene', 'elevator', '--duration', 1)
+    assert re.search(r'no closed form\n.*\n  nutation_period +0\.\d+\n', told(capsys, ride)[1])
     text = told(capsys, stepped)[1]
     assert 'whole, 3 s' in text and '/a/b/ground_truth/imu' in text
     assert 'motion 3 (command), 1 to 2.0031 s: loops' in text
     assert re.search(r'nutation_period +0\.433970\d+ +0\.433970\d+ +-?\d\.\de-1\d\n', text)
-    assert 'journal: 3 commands, 0 resets' in text
-    for tool in (inspect, recover, simulate):
-        with pytest.raises(SystemExit):
-            tool.main(['--help'])
-        assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
 def test_json_is_strict_and_documented(short, capsys):
@@ -141,27 +145,17 @@ def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_
         writer.finish()
     code, content = as_json(capsys, path)
     assert code == 0 and content['run'] is None
-    assert content['topics']['/thing']['count'] == 11
-    assert content['topics']['/thing']['rate'] == pytest.approx(10.0)
+    thing = content['topics']['/thing']
+    assert (thing['count'], thing['rate']) == (11, 10.0)
     code, out, _ = told(capsys, path)
     assert code == 0 and out.count('not recorded by spinning_top_sim') == 1
     assert out.replace('\n', '').isprintable()
     assert '/\\x1b[2J\\u202e\\x9b\\nline' in out and 'a/\\x1b]0;b\\x07' in out
-    code, _, err = told(capsys, path, '--verify')
-    assert code == 1 and err.startswith('spinning-top inspect: --verify: it was not recorded by')
+    for option in ('--verify', f'--export=tum:{tmp_path / "a"}'):
+        code, _, err = told(capsys, path, option)
+        assert code == 1 and err.startswith('spinning-top inspect: it was not recorded by')
     code, _, err = told(capsys, path, '--plot', tmp_path / 'no.png')
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
-
-
-@pytest.mark.parametrize(('key', 'text'), [
-    ('parameters', '[' * 100_000), ('parameters', '{"top.lambda1": 1e-320}'),
-    ('begun_ns', str(10 ** 18)), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
-    ('history', '[[0, 1, NaN]]'), ('epoch_ns', 'NaN')])
-def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
-    path = rewritten(short, tmp_path / 'odd.mcap', metadata={key: text})
-    code, out, err = told(capsys, path, '--verify')
-    assert code == 1 and '\n' not in err[:-1]
-    assert 'cannot be used' in err or ('/pose' in out and 'verify: the run cannot be' in out)
 
 
 def test_pictures_are_drawn(short, tmp_path, capsys):
@@ -173,7 +167,6 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert min(pixels.shape) > 600 and 0.02 < np.mean(pixels < 250) < 0.5
     frames = image.open(film)
     assert frames.n_frames == 7 and frames.info['duration'] == 50 and frames.width == 640
-    assert film.stat().st_size < 400_000
     shown = []
     for number in (0, 6):
         frames.seek(number)
@@ -181,30 +174,15 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
-def test_a_plot_of_many_nutations_is_of_the_first_and_says_so(stepped, tmp_path, capsys,
-                                                              monkeypatch):
+def test_a_plot_of_many_motions_is_of_the_first_and_says_so(stepped, tmp_path, capsys,
+                                                            monkeypatch):
     pytest.importorskip('matplotlib')
-    content, titles = as_json(capsys, stepped)[1], []
-    for most in (40, 4):
-        monkeypatch.setattr(inspect, 'MOST_NUTATIONS', most)
-        assert told(capsys, stepped, '--plot', tmp_path / f'{most}.svg')[0] == 0
-        *_, title = re.findall('<!-- (.*) -->', (tmp_path / f'{most}.svg').read_text())
-        titles.append(title)
-    assert titles[0] == 'stepped.mcap: 3 of 4 motions'
-    end, = re.findall(r'3 of 4 motions, up to (.*) s of 3 s', titles[1])
-    end_ns = content['motions'][0]['begin_ns'] + float(end) * SECOND
-    nutations = sum(max(0.0, min(end_ns, one['end_ns']) - one['begin_ns'])
-                    / one['exact']['nutation_period'] / SECOND for one in content['motions'])
-    assert nutations == pytest.approx(4.5, abs=0.5)
-
-
-def test_samples_that_are_far_apart_are_drawn(tmp_path, capsys, monkeypatch):
-    pytest.importorskip('matplotlib')
-    pytest.importorskip('PIL.Image')
-    monkeypatch.setattr(inspect, 'LONGEST_S', 0.1)
-    log = log_of(tmp_path / 'run.mcap', '--duration', 2, '-p', 'record.streams:=[pose]',
-                 '-p', 'pose.rate:=2.0')
-    assert told(capsys, log, '--animate', tmp_path / 'top.gif')[0] == 0
+    for seconds, title in ((20.0, '4 motions, up to 3 s of 3 s'),
+                           (0.5, '4 motions, up to 0.51 s of 3 s')):
+        monkeypatch.setattr(inspect, 'PLOTTED_S', seconds)
+        path = tmp_path / f'{seconds}.svg'
+        assert told(capsys, stepped, '--plot', path)[0] == 0
+        assert re.findall('<!-- stepped.mcap: . of (.*) -->', path.read_text()) == [title]
 
 
 @pytest.mark.parametrize('options', [
@@ -218,24 +196,18 @@ def test_two_outputs_are_two_files(short, tmp_path, capsys, monkeypatch, options
     assert [path.name for path in tmp_path.iterdir()] == ['sub']
 
 
-def test_without_a_reader_of_the_output_all_is_done_and_the_code_is_kept(short, tmp_path):
-    torn, readings = tmp_path / 'torn.mcap', tmp_path / 'a.csv'
+def test_without_a_reader_of_the_output_all_is_done_and_nothing_is_imported_unasked(
+        short, tmp_path):
+    torn = tmp_path / 'torn.mcap'
     torn.write_bytes(short.read_bytes()[:-100])
-    ours, theirs = os.pipe()
-    os.close(ours)
-    ended = subprocess.run([sys.executable, '-m', 'spinning_top_sim', 'inspect', torn, '--verify',
-                            f'--export=euroc_imu:{readings}'], stdout=theirs,
-                           stderr=subprocess.PIPE, timeout=60, check=False)
-    os.close(theirs)
-    assert (ended.returncode, ended.stderr) == (1, b'') and readings.exists()
-
-
-def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):
     code = ('import sys\nfrom spinning_top_sim.tools import inspect, simulate\n'
             f'simulate.main(["-o", {str(tmp_path / "run.csv")!r}, "--duration", "1"])\n'
-            'early = sorted({"scipy"} & set(sys.modules))\n'
-            f'inspect.main([{str(short)!r}, "--verify"])\n'
-            'print("loaded:", early, sorted({"rclpy", "matplotlib"} & set(sys.modules)))')
-    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                         timeout=60, check=True)
-    assert run.stdout.strip().endswith('loaded: [] []')
+            'early = {"scipy"} & set(sys.modules)\n'
+            f'code = inspect.main([{str(torn)!r}, "--verify"])\n'
+            'print(code, *early, *({"rclpy", "matplotlib"} & set(sys.modules)), file=sys.stderr)')
+    ours, theirs = os.pipe()
+    os.close(ours)
+    ended = subprocess.run([sys.executable, '-c', code], stdout=theirs, stderr=subprocess.PIPE,
+                           timeout=60, check=True)
+    os.close(theirs)
+    assert ended.stderr == b'1\n'

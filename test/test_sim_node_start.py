@@ -127,7 +127,7 @@ def test_the_last_value_of_the_options_wins_as_in_simulate_and_ros_overrides_it(
     assert simulate.main(['-o', str(tmp_path / 'ours.mcap'), '--quiet', '--duration', '0.1',
                           *options]) == 0
     with LogReader(tmp_path / 'ours.mcap') as log:
-        ours = read_run_description(log).values_at_recording
+        ours = read_run_description(log).values_in_effect
     names = 'spin.l3', 'solver.rtol', 'imu.rate', 'imu.lever_arm', 'seed', 'spin.lz'
     _, found = start_values(*options)
     assert [found[name] for name in names] == [ours[name] for name in names] == [

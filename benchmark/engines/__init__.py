@@ -26,7 +26,7 @@ def model(top: Any, start: Any, file_format: str) -> str:
         'theta', 'theta_dot', 'phi', 'psi')}
     values |= {'spin.l3': start.l3, 'spin.lz': start.lz, 'imu.lever_arm': top.lever_arm,
                'imu.rpy': tuple(mounting(top).as_euler('xyz'))}
-    return export.model(parameters.checked(values), file_format, 'top')
+    return export.model(parameters.checked(values), file_format)
 
 
 def mounting(top: Any) -> Rotation:

@@ -10,7 +10,6 @@ exit codes:
 
 import argparse
 import html
-import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -28,7 +27,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, scene_file, urdf
 
 FORMATS = ('mjcf', 'urdf', 'sdf')
-PIVOT = '.\n     The pivot of this scene moves. Here it rests.'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,28 +38,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    names = [Path(one).stem for one in (arguments.scene, *arguments.params) if one]
-    text = model(parameters.checked(scene_file.given(arguments)), arguments.model,
-                 names[0] if names else 'spinning_top')
-    cli.check_output(arguments.output)
+    text = model(parameters.checked(scene_file.given(arguments)), arguments.model)
     with new_file(arguments.output) as file:
         file.write(text)
     return cli.OK
 
 
-def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
+def model(values: Mapping[str, Any], file_format: str) -> str:
     """
-    Return the model of a top.
-
-    values : checked parameters
-    file_format : one of FORMATS
-    name : of the model; that of a URDF file is `spinning_top`
+    Return the model `spinning_top` with checked parameters, in one of FORMATS.
 
     Raises ValueError if no rigid body has the inertia, or, of URDF, if the frames form no tree.
     """
-    if fault := urdf.inertia_fault(values):
-        raise ValueError(fault)
     top, start = parameters.top_of(values), parameters.start_state(values)
+    if not (top.mass > 0.0 and top.is_realizable):
+        raise ValueError(
+            f'{top}: no rigid body has these (mass > 0, lambda3 <= 2 (lambda1 - M R^2))')
     shape = Shape(top)
     # 'rk45' returns the start as it is, the exact motion rounds it.
     states = solve(top, start, [0.0], method='rk45')
@@ -79,9 +71,8 @@ def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
     # With all the digits that their doubles have.
     words = {key: ' '.join(repr(float(one)) for one in np.atleast_1d(value))
              for key, value in numbers.items()}
-    words |= {'name': re.sub(r'[^\w.]+', '_', name), 'body': html.escape(values['body_frame']),
-              'imu': html.escape(values['imu.frame_id']),
-              'pivot': '' if parameters.pivot_path(values) is None else PIVOT}
+    words |= {name: html.escape(values[key]) for name, key in (
+        ('body', 'body_frame'), ('imu', 'imu.frame_id'))}
     if file_format == 'urdf':
         with needed('a URDF file', 'xacro'):
             text = urdf.robot_description(values, share() / 'urdf')

@@ -5,9 +5,8 @@ from the data beside the exact ones. Reads damaged logs, too.
 
 exit codes:
   0    no fault was found
-  1    the file cannot be read or is damaged, --verify found a difference,
-       could not compute the run or is for another version (logs of 1.x), or a
-       picture could not be drawn
+  1    the file is damaged or cannot be read, --verify found a difference or
+       cannot compute the run (logs of 1.x), or a picture cannot be drawn
   2    wrong arguments
   130  interrupted
 The keys of --json are in docs/logs.md.
@@ -16,29 +15,30 @@ The keys of --json are in docs/logs.md.
 import argparse
 import json
 import sys
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import fields
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
-from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import joined, relative_drift
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import NANOSECONDS, stamp_text
-from spinning_top_sim.tools import cli, log_exports
-from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
-from spinning_top_sim.tools.survey import Motion, Survey, Topic
-from spinning_top_sim.tools.verify import Comparison, compare, objection
+from spinning_top_sim.tools import cli, recorded_run
+from spinning_top_sim.tools.recorded_run import RunDescription, channels_of
+from spinning_top_sim.tools.survey import Motion, Survey
 
-FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
-MOST_NUTATIONS, RESTS = 40, 9       # that a plot tells apart; digits of a tilt that rests
-NUMBERS = [one.name for one in fields(Description) if one.name != 'name']
+PLOTTED_S, ANIMATED_S = 20.0, 10.0      # that a picture shows at most
+# Of each kind of export: the topics that have its numbers, the best first.  TUM (vision.in.tum.de,
+# RGB-D dataset, file formats) has "timestamp tx ty tz qx qy qz qw", in s and m; EuRoC (M. Burri et
+# al., IJRR 35, 2016) imu0/data.csv.
+KINDS = {'tum': ('ground_truth/imu_odom', 'ground_truth/odom'), 'euroc_imu': ('imu/data_raw',)}
+EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
+                  'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,132 +52,155 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='draw the turning top; likewise')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
-    log_exports.add_argument(parser)
+    add('--export', type=_kind_and_file, metavar='KIND:FILE', action='append', default=[],
+        help='write a file for other tools: tum, the true trajectory of the IMU, or of the body '
+        'where the log has no ground_truth/imu_odom; euroc_imu, readings (CSV); may be repeated; '
+        'an existing file is never overwritten')
     add('--json', action='store_true', help='print everything as JSON')
+
+
+def _kind_and_file(text: str) -> tuple[str, Path]:
+    kind, colon, name = text.partition(':')
+    if kind not in KINDS or not name:
+        raise argparse.ArgumentTypeError(
+            f'{text}: must be KIND:FILE with one of {", ".join(KINDS)}, such as tum:truth.tum')
+    return kind, Path(name)
 
 
 def _run(arguments: argparse.Namespace) -> int:
     cli.check_output(arguments.plot, arguments.animate, *(path for _, path in arguments.export))
     with LogReader(arguments.log) as reader:
-        run, foreign, exported = None, '', list[str]()
+        run, notes = None, list[str]()
         try:
-            run = read_run_description(reader)
-        except ForeignLogError as error:
-            foreign = str(error)
-        for option, reason in (('verify', foreign or objection(run)), ('export', foreign)):
-            if reason and getattr(arguments, option):
-                raise LogError(f'--{option}: {reason}')
+            run = recorded_run.read_run_description(reader)
+            _check_exports(run, arguments.export)
+        except recorded_run.ForeignLogError as error:
+            if arguments.verify or arguments.export:
+                raise
+            notes.append(str(error))
+        found = Survey(reader, run, notes)
         if run is not None:
-            log_exports.check(run, arguments.export)
-        found = Survey(reader, run)
-        if run is None:
-            found.notes.append(foreign)
-        else:
-            if arguments.verify:
-                found.verify = compare(run, reader, found.last_ns)
-            exported += log_exports.write(reader, run, arguments.export)
+            found.verify = recorded_run.compare(run, reader) if arguments.verify else None
+            _export(reader, run, arguments.export)
     if arguments.json:
         with cli.reader_may_end():
-            text = json.dumps(found, default=lambda one: {
-                name: value for name, value in vars(one).items() if not name.startswith('_')})
             # Numbers that JSON does not have become null.
-            print(json.dumps(json.loads(text, parse_constant=lambda name: None), indent=2))
+            print(json.dumps(json.loads(json.dumps(found, default=_public),
+                                        parse_constant=lambda name: None), indent=2))
     else:
         for line in _as_text(found):
             cli.print_line(line)
-    for line in exported:
-        cli.print_line(line, sys.stderr if arguments.json else None)
-    _draw(arguments, found)
+    if arguments.plot or arguments.animate:
+        _draw(arguments, found)
     passed = found.whole and (found.verify is None or found.verify.identical)
     return cli.OK if passed else cli.FAILED
 
 
+def _public(one: object) -> dict[str, Any]:
+    return {name: value for name, value in vars(one).items()
+            if name != 'states' and not name.startswith('_')}
+
+
+def _check_exports(run: RunDescription, exports: Sequence[tuple[str, Path]]) -> None:
+    """Raise ValueError if the log lacks the topic that an export needs."""
+    for kind, _ in exports:
+        if not any(topic in run.topics for topic in KINDS[kind]):
+            raise ValueError(f'--export {kind}: the log has no {" and no ".join(KINDS[kind])}')
+
+
+def _export(reader: LogReader, run: RunDescription, exports: Sequence[tuple[str, Path]]) -> None:
+    """Write the files, and say of what they are.  Raises OSError."""
+    for kind, path in exports:
+        topic = next(topic for topic in KINDS[kind] if topic in run.topics)
+        is_tum = kind == 'tum'
+        template = next(channel.template for channel in channels_of(run.values_in_effect)
+                        if channel.topic == topic)
+        with new_file(path) as file:
+            file.write('' if is_tum else EUROC_IMU_HEAD)
+            for _, group in reader.groups([run.topics[topic]]):
+                data = b''.join(one.data for one in group if len(one.data) == len(template))
+                # Place and attitude, or rates and accelerations, are the first two fields.
+                rows = np.hstack(template.decode(data)[:2]).tolist()
+                for stamp_ns, row in zip(template.stamps_ns(data).tolist(), rows, strict=True):
+                    words = [stamp_text(stamp_ns) if is_tum else str(stamp_ns), *map(repr, row)]
+                    file.write((' ' if is_tum else ',').join(words) + '\n')
+        cli.print_line(f'{path}: {kind}, from {topic}', sys.stderr)
+
+
 def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     """Draw the pictures.  Raises LogError, or OSError or ValueError for the name of a file."""
-    if arguments.plot is None and arguments.animate is None:
-        return
-    if not found.shown:
+    shown = [one.states for one in found.motions if one.states]
+    if not shown:
         raise LogError('nothing to draw: no attitude of a top in this log')
     with needed('a picture', 'plot'):
-        from matplotlib.animation import PillowWriter  # noqa: PLC0415
-
         from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
     if arguments.plot is not None:
+        states, begins = joined(shown), [one.t[0] for one in shown]
         # A motion is of one energy.
-        change = [relative_drift(one.energy, one.energy[:1]) for one in found.shown]
-        begins, states = [one.t[0] for one in found.shown], joined(found.shown)
-        rises = np.diff(states.theta_folded.round(RESTS)) > 0.0
-        tops = states.t[1:-1][rises[:-1] & ~rises[1:]]
-        end = tops[MOST_NUTATIONS] if len(tops) > MOST_NUTATIONS else states.t[-1]
+        change = [relative_drift(one.energy, one.energy[:1]) for one in shown]
+        end = min(begins[0] + PLOTTED_S, states.t[-1])
         figure = pictures.plot(states, np.concatenate(change), begins[1:], end)
-        title = (f'{arguments.log.name}: {sum(one <= end for one in begins)} of '
-                 f'{len(found.motions)} motions')
-        if end < states.t[-1]:
-            title += f', up to {end:.4g} s of {states.t[-1]:.4g} s'
-        missing = [one.measured.missing for one in found.motions if one.measured]
-        figure.suptitle('\n'.join((title, *list(filter(None, missing))[:1])))
+        figure.suptitle(f'{arguments.log.name}: {sum(one <= end for one in begins)} of '
+                        f'{len(found.motions)} motions, up to {end:.4g} s of {states.t[-1]:.4g} s')
         with new_file(arguments.plot) as file:
             figure.savefig(file.name, format=arguments.plot.suffix[1:] or 'png', dpi=120)
     if arguments.animate is not None:
         with new_file(arguments.animate) as file:
-            pictures.animate(found.shown[0], FRAMES_PER_S, LONGEST_S).save(
-                file.name, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)  # 4 inches
+            pictures.animate(shown[0], seconds=ANIMATED_S).save(
+                file.name, writer='pillow', dpi=160)
 
 
 def _as_text(found: Survey) -> Iterator[str]:
     """Yield the findings as lines of text."""
-    state = 'whole' if found.whole else 'truncated' if found.damage['torn'] else 'damaged'
-    yield f'{found.file}: {state}, {(found.end_ns - found.begin_ns) / NANOSECONDS:.6g} s'
+    yield (f'{found.file}: {"whole" if found.whole else "damaged"}, '
+           f'{(found.end_ns - found.begin_ns) / NANOSECONDS:.6g} s')
     yield from found.damage['report']
     if found.run is not None:
-        values, counts = found.run.values_at_start, Counter(
-            event.kind for _, event in found.run.events)
+        values = found.run.values_at_start
         yield (f'spinning_top_sim {found.run.environment["version"]}, '
                f'{values["solver.method"]}, seed {values["seed"]}')
-        yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-               f'{counts["parameters"]} changes of parameters')
     yield from found.notes
-    yield from _topics(found.topics)
+    rows = []
+    for name, topic in found.topics.items():
+        begin, end = topic['longest_gap_ns'] or (0, 0)
+        gap = (_number((end - begin) / NANOSECONDS, 9), stamp_text(begin)) if end else ('', '')
+        rows.append((name, topic['type'], str(topic['count']), _number(topic['rate']), *gap))
+    yield from cli.table_lines('topics', (
+        'topic', 'type', 'messages', 'rate [Hz]', 'longest gap [s]', 'from [s]'), rows)
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, found.begin_ns)
     if found.verify is not None:
         yield from _verdict(found.verify)
 
 
-def _topics(topics: dict[str, Topic]) -> Iterator[str]:
-    rows = []
-    for name, topic in topics.items():
-        begin, end = topic.longest_gap_ns or (0, 0)
-        gap = (f'{(end - begin) / NANOSECONDS:.9g}', stamp_text(begin)) if end else ('', '')
-        rows.append((name, topic.type, str(topic.count), _number(topic.rate), *gap))
-    yield from cli.table_lines('topics', (
-        'topic', 'type', 'messages', 'rate [Hz]', 'longest gap [s]', 'from [s]'), rows)
-
-
-def _motion(number: int, motion: Motion, begin_ns: int) -> Iterator[str]:
-    begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
+def _motion(number: int, motion: Motion, log_ns: int) -> Iterator[str]:
+    begin, end = (max(at_ns - log_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))
-    rows = [(name, _number(exact, 12), _number(seen, 12), _number(
-        None if exact is None or seen is None else seen - exact, 2)) for name, exact, seen in (
-            (name, getattr(motion.exact, name, None), getattr(motion.measured, name, None))
-            for name in NUMBERS)]
+    exact, measured = vars(motion.exact) if motion.exact else {}, motion.measured or {}
+    rows = []
+    for name in dict.fromkeys((*exact, *measured)):
+        truth, seen = exact.get(name), measured.get(name)
+        apart = seen - truth if isinstance(truth, float) and isinstance(seen, float) else None
+        rows.append((name, _number(truth, 12), _number(seen, 12), _number(apart, 2)))
     rows += [(f'drift of {name}', '', '', _number(drift, 2))
              for name, drift in motion.drifts.items()]
     rows.append(('orientation_error', '', '', _number(motion.orientation_error, 2)))
     yield from cli.table_lines(
         f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: '
-        f'{motion.exact.name if motion.exact else "no closed form"}',
+        f'{exact.get("name", "no closed form")}',
         ('[s, rad, rad/s]', 'exact', 'measured', 'difference'),
         [row for row in rows if any(row[1:])])
-    if motion.measured is None:
-        yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
-    else:
-        yield f'measured from {motion.source}: {motion.measured.nutations} whole nutations'
-        if motion.measured.missing:
-            yield f'not measured: {motion.measured.missing}'
+    yield (f'measured from {motion.source}: {measured["nutations"]} whole nutations' if measured
+           else 'not measured: fewer than two attitudes, or gaps between them')
+    if measured.get('missing'):
+        yield f'not measured: {measured["missing"]}'
 
 
-def _verdict(verdict: Comparison) -> Iterator[str]:
+def _number(value: object, digits: int = 6) -> str:
+    return f'{value:.{digits}g}' if isinstance(value, float) else ''
+
+
+def _verdict(verdict: recorded_run.Comparison) -> Iterator[str]:
     for warning in verdict.warnings:
         yield f'verify: {warning}: the last bits may differ for that'
     compared = sum(verdict.compared.values())
@@ -190,10 +213,6 @@ def _verdict(verdict: Comparison) -> Iterator[str]:
                f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
     if verdict.first:
         yield f'verify: first: {verdict.first}'
-
-
-def _number(value: float | None, digits: int = 6) -> str:
-    return '' if value is None else f'{value:.{digits}g}'
 
 
 main = partial(cli.run, 'inspect', __doc__, add_arguments, _run)

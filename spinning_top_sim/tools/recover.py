@@ -21,30 +21,25 @@ from pathlib import Path
 from spinning_top_sim.recording.reader import LogReader, recover
 from spinning_top_sim.tools import cli
 
-SOME_LOST = 3
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     parser.add_argument('log', type=Path, help='the MCAP file, of this package or any other, or a '
                         'folder with one')
-    parser.add_argument(
-        '-o', '--output', type=Path, metavar='FILE',
-        help='the new file; it must not exist (default: <log>_recovered.mcap beside the log)')
+    parser.add_argument('-o', '--output', type=Path, metavar='FILE', required=True,
+                        help='the new file; it must not exist')
 
 
 def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
-        output: Path = arguments.output or reader.path.with_name(
-            f'{reader.path.stem}_recovered.mcap')
-        cli.check_output(output)
-        messages = recover(reader, output)
+        cli.check_output(arguments.output)
+        messages = recover(reader, arguments.output)
     for line in reader.damage:
         cli.print_line(line)
     is_all = not (reader.lost_bytes or reader.changed)
     cli.print_line(f'{"kept all that it has" if is_all else "kept"}: {messages} messages, '
-                   f'{output.stat().st_size} bytes in {output}')
-    return cli.OK if is_all else SOME_LOST
+                   f'{arguments.output.stat().st_size} bytes in {arguments.output}')
+    return cli.OK if is_all else 3     # some was lost
 
 
 main = partial(cli.run, 'recover', __doc__, add_arguments, _run)

@@ -29,7 +29,7 @@ class LogSource:
                 raise LogError(f'{path}: {error}') from error
             self.track = SampledTrack(run.values_in_effect, run.epoch_ns)
             last_ns = _end_of_top(run)
-            self._read(reader, run, last_ns or recorded_run.LAST_LOG_TIME_NS)
+            self._read(reader, run, last_ns or 1 << 62)     # stamps that int64 can hold
             notes = {'is damaged: what is whole is shown': not reader.whole,
                      'is shown up to the reset to another top': last_ns}
         if not len(self.track.rows):

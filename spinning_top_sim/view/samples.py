@@ -10,12 +10,12 @@ from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.times import NANOSECONDS, Times, period_ns
-from spinning_top_sim.tools.analysis import SampledStates, attitudes_of
+from spinning_top_sim.tools.survey import SampledStates, attitudes_of
 from spinning_top_sim.view.source import Reals, Track
 
 # The topics that tell the attitude, the one that tells most first.
 TOPICS = ('ground_truth/odom', 'joint_states', 'pose', 'ground_truth/imu')
-# Columns of a sample: attitude and rates, as in `analysis`; place of the pivot.  NaN: not known.
+# Columns of a sample: attitude and rates, as in `survey`; place of the pivot.  NaN: not known.
 MOTION, PLACE, WIDTH = slice(0, 7), slice(7, 10), 10
 
 

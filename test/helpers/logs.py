@@ -120,13 +120,12 @@ def write_stranger(path, options, count=300):
     return messages
 
 
-def write_bag(folder, mode='', form='zstd', compress=zstandard.compress, split=1, *,
-              record=True):
+def write_bag(folder, mode='', split=1, *, record=True):
     """Write what matters of a bag as rosbag2 does, with ten strings."""
     folder.mkdir()
-    about = f"compression_format: {form}\ncompression_mode: '{mode}'\n"
+    about = f"compression_format: zstd\ncompression_mode: '{mode}'\n"
     texts = [b'\0\1\0\0\x06\0\0\0text%d\0' % number for number in range(10)]
-    rows = [(0, number, compress(text) if mode == 'MESSAGE' else text)
+    rows = [(0, number, zstandard.compress(text) if mode == 'MESSAGE' else text)
             for number, text in enumerate(texts)]
     for part in range(split):
         path = write_rows(
@@ -134,7 +133,7 @@ def write_bag(folder, mode='', form='zstd', compress=zstandard.compress, split=1
             [RecordedTopic('/said', 'std_msgs/msg/String')], rows,
             **({'rosbag2': {'serialized_metadata': about}} if record else {}))
         if mode == 'FILE':
-            path.with_name(f'{path.name}.{form}').write_bytes(compress(path.read_bytes()))
-            path.unlink()
+            packed = zstandard.compress(path.read_bytes())
+            path.rename(f'{path}.zstd').write_bytes(packed)
     (folder / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  ' + about.replace(
         '\n', '\n  '))

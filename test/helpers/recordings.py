@@ -4,7 +4,6 @@
 import struct
 from collections import Counter
 
-import numpy as np
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -56,9 +55,3 @@ def some_messages(count: int) -> list[tuple[int, int, bytes]]:
     """Messages of the first two topics in turn, 1 ms apart."""
     makers = (pose_cdr, array_cdr)
     return [(n % 2, EPOCH_NS + n * 1_000_000, makers[n % 2](n)) for n in range(count)]
-
-
-def rows_of(begin: int, end: int):
-    """Return a block of messages of the first topic, stamped by their numbers."""
-    data = b''.join(map(pose_cdr, range(begin, end)))
-    return 0, np.arange(begin, end), np.frombuffer(data, np.uint8).reshape(end - begin, -1)

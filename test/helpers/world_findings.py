@@ -19,11 +19,10 @@ from spinning_top_sim.recording import recorder, rosbag2, writer
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader, recover
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.events import COMMANDS, EVENTS, TOPICS, Event
+from spinning_top_sim.streams.events import COMMANDS, EVENTS, Event
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import resolve_topic
-from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.verify import compare
+from spinning_top_sim.tools.recorded_run import compare, read_run_description
 
 SLACK_NS = 4 * MILLISECOND     # between a time that is noted here, and that of the recorder
 
@@ -183,17 +182,15 @@ def read(path, *, verified):
             with LogReader(whole) as recovered:
                 assert recovered.whole and messages(recovered) == kept
         if verified:            # that computes the run a third time
-            verify(reader, kept)
+            verify(reader)
         return reader.whole, kept
     return False, {}
 
 
-def verify(reader, kept):
+def verify(reader):
     run = read_run_description(reader)
-    stamps = [kept[topic][-1][0] for name, topic in run.topics.items()
-              if topic in kept and name not in TOPICS]
-    if stamps and not reader.lost_bytes:
-        comparison = compare(run, reader, max(stamps))
+    if not reader.lost_bytes:
+        comparison = compare(run, reader)
         assert comparison.identical, comparison.first or comparison.stopped
 
 
