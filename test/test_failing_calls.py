@@ -21,7 +21,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
 from spinning_top_sim.tools import inspect, simulate
 
-FAILURES = (errno.ENOSPC, None)
+FAILURES = (errno.ENOSPC, errno.EIO, errno.EINTR, None)
 
 
 def each_failing(act, check, more=()):
