@@ -47,8 +47,34 @@ def test_numbers_and_stamps_are_those_of_messages_to_the_last_bit(
     assert np.array_equal(np.array(rows, np.float64)[:, 1:], [*map(numbers_of, messages)])
 
 
+def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(tmp_path):
+    """In the world the velocity is the rate of the position."""
+    log, path = log_of(
+        tmp_path / 'run.mcap', '--duration', 1, '-p', 'ground_truth_imu_odom.enabled:=true', '-p',
+        'ground_truth_imu_odom.rate:=125.0', '-p', 'imu.lever_arm:=[0.1, -0.2, 0.3]', '-p',
+        'imu.gyroscope_random_walk:=1e-2', '-p', 'imu.accelerometer_turn_on_bias:=0.1',
+        ), tmp_path / 'a'
+    assert inspect.main([str(log), '--export', f'euroc:{path}']) == 0
+    found = {}
+    with AnyReader([log]) as reader:
+        for connection, at_ns, data in reader.messages():
+            found.setdefault(connection.topic, {})[at_ns] = reader.deserialize(
+                data, connection.msgtype)
+    poses, biases = found['/ground_truth/imu_odom'], found['/ground_truth/imu_bias']
+    rows = np.loadtxt(path, delimiter=',')
+    assert rows[:, 0].tolist() == [*poses]
+    places = np.array([pose_in(one) for one in poses.values()])
+    assert np.array_equal(rows[:, 1:8], places[:, [0, 1, 2, 6, 3, 4, 5]])
+    rate = np.gradient(places[:, :3], 0.008, axis=0)[1:-1]
+    assert np.abs(rate - rows[1:-1, 8:11]).max() <= 1e-2 * np.abs(rate).max()
+    assert rows[:, 11:].tolist() == [
+        readings_in(biases[max(at_ns for at_ns in biases if at_ns <= pose_ns)])
+        for pose_ns in poses]
+
+
 @pytest.mark.parametrize(('kind', 'reason', 'code'), [
-    ('euroc_imu:DIR/a', 'no imu/data_raw', 2), ('euroc_imu:DIR/there', 'there: File exists', 1)])
+    ('euroc_imu:DIR/a', 'no imu/data_raw', 2), ('euroc:DIR/a', 'no ground_truth/imu_odom', 2),
+    ('euroc_imu:DIR/there', 'there: File exists', 1)])
 def test_what_cannot_be_exported_is_told(tmp_path, capsys, kind, reason, code):
     (tmp_path / 'there').write_text('precious')
     log = log_of(tmp_path / 'run.mcap', '--duration', 1, '-p', 'imu.enabled:=false')

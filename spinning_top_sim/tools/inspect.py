@@ -21,24 +21,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.states import joined, relative_drift
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.times import NANOSECONDS, stamp_text
+from spinning_top_sim.times import NANOSECONDS, Times, stamp_text
 from spinning_top_sim.tools import cli, recorded_run
 from spinning_top_sim.tools.recorded_run import RunDescription, channels_of
 from spinning_top_sim.tools.survey import Motion, Survey
 
+Reals = NDArray[np.float64]
 PLOTTED_S, ANIMATED_S = 20.0, 10.0      # that a picture shows at most
-# Of each kind of export: the topics that have its numbers, the best first.  TUM (vision.in.tum.de,
-# RGB-D dataset, file formats) has "timestamp tx ty tz qx qy qz qw", in s and m; EuRoC (M. Burri et
-# al., IJRR 35, 2016) imu0/data.csv.
-KINDS = {'tum': ('ground_truth/imu_odom', 'ground_truth/odom'), 'euroc_imu': ('imu/data_raw',)}
-EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
-                  'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
+# Topics, of which an export has the numbers.  TUM (vision.in.tum.de, RGB-D dataset, file formats)
+# has "timestamp tx ty tz qx qy qz qw", in s and m; EuRoC (M. Burri et al., IJRR 35, 2016)
+# state_groundtruth_estimate0/data.csv and imu0/data.csv.
+IMU, BIAS, BODY = 'ground_truth/imu_odom', 'ground_truth/imu_bias', 'ground_truth/odom'
+KINDS = {'tum': (IMU,), 'euroc': (IMU, BIAS), 'euroc_imu': ('imu/data_raw',)}
+HEADS = {'tum': '', **{kind: f'#timestamp [ns],{columns}\n' for kind, columns in (
+    ('euroc', 'p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],'
+     'v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],b_w_RS_S_x [rad s^-1],'
+     'b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],'
+     'b_a_RS_S_z [m s^-2]'),
+    ('euroc_imu', 'w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],a_RS_S_x [m s^-2],'
+     'a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]'))}}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,8 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
     add('--export', type=_kind_and_file, metavar='KIND:FILE', action='append', default=[],
-        help='write a file for other tools: tum, the true trajectory of the IMU, or of the body '
-        'where the log has no ground_truth/imu_odom; euroc_imu, readings (CSV); may be repeated; '
+        help='write a file for other tools: tum or euroc, the true trajectory of the IMU (tum: of '
+        f'the body where the log has no {IMU}); euroc_imu, its readings (CSV); may be repeated; '
         'an existing file is never overwritten')
     add('--json', action='store_true', help='print everything as JSON')
 
@@ -73,7 +82,8 @@ def _run(arguments: argparse.Namespace) -> int:
         run, notes = None, list[str]()
         try:
             run = recorded_run.read_run_description(reader)
-            _check_exports(run, arguments.export)
+            for kind, _ in arguments.export:
+                _topics(run, kind)
         except recorded_run.ForeignLogError as error:
             if arguments.verify or arguments.export:
                 raise
@@ -101,29 +111,46 @@ def _public(one: object) -> dict[str, Any]:
             if name != 'states' and not name.startswith('_')}
 
 
-def _check_exports(run: RunDescription, exports: Sequence[tuple[str, Path]]) -> None:
-    """Raise ValueError if the log lacks the topic that an export needs."""
-    for kind, _ in exports:
-        if not any(topic in run.topics for topic in KINDS[kind]):
-            raise ValueError(f'--export {kind}: the log has no {" and no ".join(KINDS[kind])}')
+def _topics(run: RunDescription, kind: str) -> Sequence[str]:
+    """Return the topics of an export.  Raises ValueError if the log lacks one."""
+    if kind == 'tum' and IMU not in run.topics and BODY in run.topics:
+        return (BODY,)
+    for topic in KINDS[kind]:
+        if topic not in run.topics:
+            raise ValueError(f'--export {kind}: the log has no {topic}')
+    return KINDS[kind]
+
+
+def _rows(reader: LogReader, run: RunDescription, topic: str) -> tuple[Times, list[Reals]]:
+    """Return stamps (n,) [ns] and fields of the messages of a stream."""
+    template = next(channel.template for channel in channels_of(run.values_in_effect)
+                    if channel.topic == topic)
+    data = b''.join(one.data for one in reader.messages([run.topics[topic]])
+                    if len(one.data) == len(template))
+    return template.stamps_ns(data), list(template.decode(data))
 
 
 def _export(reader: LogReader, run: RunDescription, exports: Sequence[tuple[str, Path]]) -> None:
-    """Write the files, and say of what they are.  Raises OSError."""
+    """Write the files, and say of what they are.  Raises OSError or ValueError."""
     for kind, path in exports:
-        topic = next(topic for topic in KINDS[kind] if topic in run.topics)
-        is_tum = kind == 'tum'
-        template = next(channel.template for channel in channels_of(run.values_in_effect)
-                        if channel.topic == topic)
+        topic, *others = _topics(run, kind)
+        stamps_ns, columns = _rows(reader, run, topic)
+        if others:              # with the bias of the last reading before a sample
+            bias_ns, biases = _rows(reader, run, BIAS)
+            if not len(bias_ns):
+                raise ValueError(f'--export {kind}: the log has no sample of {BIAS}')
+            newest = np.maximum(np.searchsorted(bias_ns, stamps_ns, 'right') - 1, 0)
+            place, (x, y, z, w), velocity = columns[0], columns[1].T, columns[2].T
+            world = attitude.rotated((x, y, z, w), tuple(velocity))
+            columns = [place, np.stack([w, x, y, z], axis=1), np.stack(world, axis=1),
+                       *(bias[newest] for bias in biases)]
+        separator, text = (' ', stamp_text) if kind == 'tum' else (',', str)
         with new_file(path) as file:
-            file.write('' if is_tum else EUROC_IMU_HEAD)
-            for _, group in reader.groups([run.topics[topic]]):
-                data = b''.join(one.data for one in group if len(one.data) == len(template))
-                # Place and attitude, or rates and accelerations, are the first two fields.
-                rows = np.hstack(template.decode(data)[:2]).tolist()
-                for stamp_ns, row in zip(template.stamps_ns(data).tolist(), rows, strict=True):
-                    words = [stamp_text(stamp_ns) if is_tum else str(stamp_ns), *map(repr, row)]
-                    file.write((' ' if is_tum else ',').join(words) + '\n')
+            file.write(HEADS[kind])
+            # Place and attitude, or rates and accelerations, are the first two fields.
+            rows = np.hstack(columns if others else columns[:2]).tolist()
+            for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
+                file.write(separator.join([text(stamp_ns), *map(repr, row)]) + '\n')
         cli.print_line(f'{path}: {kind}, from {topic}', sys.stderr)
 
 
