@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.grade.command import main
-from spinning_top_sim.grade.files import PARTS, read_table
+from spinning_top_sim.grade.files import PARTS, read
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.tools.simulate import main as simulate
 
@@ -20,7 +20,7 @@ DECLARED = BODY.noise['accelerations'] ** 2 * np.eye(3).ravel()
 T = BODY.t
 NS = np.rint(1e9 * T).astype(np.int64) + 1_700_000_000_123_456_789
 VALUES = {name: column for kind, (_, values) in told(BODY).items()
-          for name, column in zip(PARTS[kind][0].split(), values.T, strict=True)}
+          for name, column in zip(PARTS[kind][0], values.T, strict=True)}
 POSES = {name: VALUES[name] for name in ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')}
 IMU = {name: VALUES[name] for name in ('gx', 'gy', 'gz', 'ax', 'ay', 'az')}
 MAKE = {name.rpartition('/')[2]: one for name, one in JAZZY.types.items()}
@@ -39,7 +39,7 @@ def same(recorded, kinds=('attitudes', 'positions', 'gyroscope', 'accelerations'
     for kind in kinds:
         times, values = recorded.parts[kind]
         assert times == pytest.approx(T, abs=2e-9), kind
-        right = np.stack([VALUES[name] for name in PARTS[kind][0].split()], axis=1)
+        right = np.stack([VALUES[name] for name in PARTS[kind][0]], axis=1)
         assert values == pytest.approx(right, abs=1e-9), kind
 
 
@@ -51,83 +51,94 @@ def test_the_table_is_read_in_any_format(tmp_path):
     parquet.write_table(pa.table(columns), tmp_path / 'a.parquet')
     np.savez(tmp_path / 'a.npz', **columns)
     brackets = {'t [ns]': NS, **{f'{name} [{next(iter(PARTS[kind][1]))}]': VALUES[name]
-                                 for kind in told(BODY) for name in PARTS[kind][0].split()}}
+                                 for kind in told(BODY) for name in PARTS[kind][0]}}
     for path in (table(tmp_path / 'a.csv', columns), tmp_path / 'a.parquet', tmp_path / 'a.npz',
                  table(tmp_path / 'b.txt', columns, ' ', '# '), table(
                      tmp_path / 'c.csv', columns, ';'), table(tmp_path / 'd.csv', brackets)):
-        same(read_table(path, None))
+        same(read(path))
 
 
 def test_columns_and_units_are_said_by_name_also_in_a_file(tmp_path):
     foreign = {'frame': range(len(T)), 'sec': NS // 10 ** 9, 'nanosec': NS % 10 ** 9, 'time': T,
                **{f'rot_{k}': POSES[name] for k, name in enumerate(('qw', 'qx', 'qy', 'qz'))},
-               **{f'gyro_{axis}': np.degrees(IMU[f'g{axis}']) for axis in 'xyz'},
+               **{f'gyro_{axis} (deg/s)': np.degrees(IMU[f'g{axis}']) for axis in 'xyz'},
                **{f'acc {axis}': IMU[f'a{axis}'] / 9.80665 for axis in 'xyz'}, 'ax': 0.0 * T}
     said = ('t=sec:s+nanosec:ns, qw=rot_0, qx=rot_1, qy=rot_2:1, qz=rot_3\n' + ', '.join(
-        f'g{axis}=gyro_{axis}:deg/s, a{axis}=acc {axis}:g' for axis in 'xyz'))
+        f'g{axis}=gyro_{axis} (deg/s), a{axis}=acc {axis}:g' for axis in 'xyz'))
     (tmp_path / 'columns').write_text(said)
     for text in (said, str(tmp_path / 'columns')):
-        recorded = read_table(table(tmp_path / 'a.csv', foreign), text)
+        recorded = read(table(tmp_path / 'a.csv', foreign), text)
         same(recorded, ('attitudes', 'gyroscope', 'accelerations'))
         assert recorded.notes[-1] == 'not used: frame, time, ax'
-    assert 'gyro_x [deg/s], gyro_y [deg/s], gyro_z [deg/s]: 600 rows, 200' in str(recorded.notes)
-    dates = {'stamp': [f'{np.datetime64(ns, "ns")}Z' for ns in NS.tolist()], **VALUES}
-    same(read_table(table(tmp_path / 'b.csv', dates), 't=stamp:iso'))
+    assert 'accelerations of acc x:g, acc y:g, acc z:g: 600 rows, 200' in str(recorded.notes)
+    dates = {'stamp': [f'{np.datetime64(ns, "ns")}+01:00' for ns in NS.tolist()], **VALUES}
+    same(read(table(tmp_path / 'b.csv', dates), 't=stamp:iso'))
 
 
 def test_what_tum_and_euroc_define_is_read(tmp_path):
     tum = {'t': T + 1.7e9, **{name: POSES[name] for name in (
         'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')}}
     path = table(tmp_path / 'a.tum', tum, ' ')
-    path.write_text(path.read_text().partition('\n')[2])
-    times, attitudes = read_table(path, None).parts['attitudes']
-    assert times == pytest.approx(T, abs=3e-7) and len(attitudes) == len(T)
+    for head in ('', '# ground truth\n# timestamp tx ty tz qx qy qz qw\n'):
+        path.write_text(head + path.read_text().partition('\n')[2])
+        times, attitudes = read(path).parts['attitudes']
+        assert times == pytest.approx(T[-len(times):] - T[-len(times)], abs=3e-7)
+        assert len(attitudes) == len(times) > 590
     table(tmp_path / 'mav0/state_groundtruth_estimate0/data.csv', {
         '#timestamp': NS, **{f' {name} [{unit}]': POSES[ours] for name, unit, ours in (
             ('p_RS_R_x', 'm', 'px'), ('p_RS_R_y', 'm', 'py'), ('p_RS_R_z', 'm', 'pz'),
             ('q_RS_w', '', 'qw'), ('q_RS_x', '', 'qx'), ('q_RS_y', '', 'qy'),
             ('q_RS_z', '', 'qz'))}})
-    path = tmp_path / 'mav0/state_groundtruth_estimate0/data.csv'
-    path.write_text(path.read_text().replace('#timestamp', '#timestamp ').replace('#', '', 1))
     table(tmp_path / 'mav0/imu0/data.csv', {'timestamp [ns]': NS, **{
         f'{name}_RS_S_{axis} [{unit}]': IMU[f'{ours}{axis}'] for name, unit, ours in (
             ('w', 'rad s^-1', 'g'), ('a', 'm s^-2', 'a')) for axis in 'xyz'}})
-    same(read_table(tmp_path / 'mav0', None))
+    same(read(tmp_path / 'mav0'))
     assert main([str(tmp_path)]) == 0
+    path = tmp_path / 'mav0/imu0/data.csv'
     path.write_text(path.read_text().replace('17000', '17036'))
-    with pytest.raises(ValueError, match='stamps must be of one clock'):
-        read_table(tmp_path / 'mav0', None)
+    with pytest.raises(ValueError, match='must be of one clock'):
+        read(tmp_path / 'mav0')
 
 
 ROWS = {'t': T, **VALUES}
 
 
+def named(**names):
+    """Return the table with some columns under other names."""
+    return {names.get(name, name): values for name, values in ROWS.items()}
+
+
 @pytest.mark.parametrize(('content', 'said', 'words'), [
-    ({'timestamp': NS, **VALUES}, None, "no column t: name timestamp, by --columns "
-     "'t=COLUMN:UNIT' with a UNIT of s, ms, us, ns, iso"),
-    ({'t': T, **{f'ref_{name}': POSES[name] for name in POSES},
-      **{f'sim_{name}': POSES[name] for name in POSES}}, None, "'qx=COLUMN:UNIT, qy=COLUMN:UNIT"),
-    ({'t': 1e3 * T, **VALUES}, None, "1e-05 to 0.5 s apart; name the unit of times by --columns "
-     "'t=COLUMN:UNIT'"),
-    ({**ROWS, 't': np.append(T[:300], T[:300])}, None, 'line 302: after 1.495 s the time of '
-     'attitudes is 0 s: one motion a file'),
-    ({**ROWS, 't': np.round(T, 2)}, None, 'one motion a file, with times of enough digits'),
+    (named(t='stamp'), None, "say --columns 't=COLUMN:UNIT', or NAME= for none, with a UNIT of s, "
+     'ms, us, ns, iso; the file has stamp, qx'),
+    (named(gx='gx_dps'), 'gy=, gz=', "'gx=gx_dps:UNIT, gy=gy:UNIT, gz=gz:UNIT', or NAME= for"),
+    (named(gx='gx [°/s]', gy='Gy', gz='imu.g_z'), None, 'gx=gx [°/s]:UNIT, gy=Gy:UNIT, gz=imu.g_z'),
+    ({'t': T, **{f'{set_}_{name}': POSES[name] for set_ in ('ref', 'sim') for name in POSES}},
+     None, 'px=ref_px or sim_px:UNIT'),
+    ({**ROWS, 'gx [deg/s]': T}, None, 'gx=gx or gx [deg/s]:UNIT'),
+    ({**ROWS, 't': 1e3 * T}, None, "5 s apart: must be 20 at least, 1e-05 to 0.5 s apart; the unit "
+     "of times in a table: --columns 't=COLUMN:UNIT'"),
+    ({**ROWS, 't': np.append(T[:300], T[:300])}, None, 'line 302: attitudes are at 0 s after 1.495 '
+     's: must ascend, one motion a file'),
+    ({**ROWS, 't': np.round(T, 2)}, None, 'must ascend, one motion a file, with enough digits'),
     ({**ROWS, 'qw': 1.5 * POSES['qw']}, None, 'line 2: |q| = '),
-    ({**ROWS, 'gx [deg/s]': T}, None, 'gx [deg/s]: say which column is gx: --columns'),
-    ({**ROWS, 'gx': ['1_0'] * len(T)}, None, "line 2: gx = '1_0' is no number"),
-    ({**ROWS, 't': ['2026-01-01T00:00:00'] * len(T)}, None, "say --columns 't=t:iso'"),
+    *(({**ROWS, 'gx': [cell] * len(T)}, None, f"line 2: gx = '{cell}': must be a number such as -1")
+      for cell in ('1_0', '1e400', 'deg/s', '-1;5')),
+    *(({**ROWS, 't': [cell] * len(T)}, said, f"line 2: t = '{cell}': must be a {right}")
+      for cell, said, right in (
+          ('2026-01-01T00:00:00', None, "number such as -12.5 (of dates say --columns 't=COLUMN:i"),
+          ('', None, 'number'), ('1.1.2026', 't=t:iso', 'date such as 2026-01-31T12:00:00.5'))),
     (ROWS, 'gx=gyro_x', '--columns gyro_x: the file has t, qx'),
-    (ROWS, 'gx=gx:rpm/s', 'with a UNIT of rad/s, mrad/s, deg/s, dps, rpm'),
+    (ROWS, 'gx=gx:rpm/s', 'unit must be one of rad/s, mrad/s, deg/s, dps, rpm'),
     (ROWS, 'speed=gx', 'must be NAME=COLUMN:UNIT, with each NAME once, of t, qx'),
-    (ROWS, 'gx=', "no column gx: name gx, by --columns 'gx=COLUMN:UNIT'"),
     ({'t': T, **POSES, **{f'gyro_{a}_dps': T for a in 'xyz'}}, None, 'nothing to grade; times of '
-     't [s]: the first is 0 s'),
-    ('t,qw\n1,2\n1,2,3\n', None, 'line 3 has 3 values, and there are 2 names'),
-    ('1,2,3\n1,2,3\n', None, 'line 1 has 3 values, and there are 0 names'),
-    ('t,qw,qw\n1,2,3\n', None, '2 columns are called qw'),
-    ('t,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n', None, '2 attitudes, 1 s apart: must be 20 at'),
-    ('', None, 'the file has no rows'),
-    ('t,qw\n1,2\n'.encode('utf-16'), None, "'utf-8' codec")])
+     't:s; the first time is 0 s'),
+    ('t,qw\n1,2\n1,2,3\n', None, 'line 3 has 3 values, and there are 2 columns'),
+    ('1,2,3\n1,2,3\n', None, 'the file has column 1, column 2, column 3'),
+    ('t,qw,qw\n1,2,3\n', None, 'two columns are called qw'),
+    ('t,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n', None, '2 rows of attitudes, 1 s apart: must be 20'),
+    ('t,qw,qx,qy,qz\n', None, '0 rows of attitudes'), ('', None, "say --columns 't=COLUMN"),
+    ('t,qw [°]\n1,2\n'.encode('latin-1'), None, 'no text in UTF-8: convert it')])
 def test_what_is_not_understood_is_refused_in_a_line_that_says_what_to_type(
         tmp_path, capsys, content, said, words):
     path = tmp_path / 'a.csv'
@@ -142,8 +153,8 @@ def test_what_is_not_understood_is_refused_in_a_line_that_says_what_to_type(
 
 
 @pytest.mark.parametrize(('name', 'words', 'code'), [
-    ('none.csv', 'No such file', 1), ('text.npz', 'is no file of numpy.savez', 2),
-    ('log.doc', 'the name must end in', 2), ('text.mcap', '', 1)])
+    ('none.csv', 'No such file', 1), ('text.npz', 'must be .mcap, or a table .csv', 2),
+    ('text.mcap', '', 1)])
 def test_what_is_no_such_file_is_told(tmp_path, capsys, name, words, code):
     path = tmp_path / name
     if name != 'none.csv':
@@ -156,12 +167,16 @@ def test_what_is_no_such_file_is_told(tmp_path, capsys, name, words, code):
 
 def test_rows_that_are_there_twice_and_empty_cells_are_noted_or_left_out(tmp_path):
     twice = {name: np.repeat(values, 2) for name, values in ROWS.items()}
-    recorded = read_table(table(tmp_path / 'a.csv', twice), None)
+    recorded = read(table(tmp_path / 'a.csv', twice))
     same(recorded)
     assert 'attitudes: 600 rows are there twice: used once' in recorded.notes
-    cells = {**ROWS, 'ay': [value if k % 2 else '' for k, value in enumerate(ROWS['ay'])]}
-    parts = read_table(table(tmp_path / 'b.csv', cells), None).parts
-    assert len(parts['accelerations'][0]) == 300 and len(parts['gyroscope'][0]) == 600
+    cells = {**ROWS, 'ay': [value if k % 2 else '' for k, value in enumerate(ROWS['ay'])],
+             'gx_bias': T}
+    recorded = read(table(tmp_path / 'b.csv', cells))
+    assert [len(recorded.parts[kind][0]) for kind in ('accelerations', 'gyroscope')] == [300, 600]
+    assert 'not used: gx_bias' in recorded.notes
+    same(read(table(tmp_path / 'c.csv', named(ax='ax_world')), 'ax=, ay=, az='),
+         ('attitudes', 'positions', 'gyroscope'))
 
 
 def vector(values, kind='Vector3'):
@@ -229,8 +244,9 @@ def test_a_log_of_this_package_is_graded_against_its_own_exact_motion(tmp_path, 
     assert main([path, '--json']) == 0
     said = json.loads(capsys.readouterr().out)
     assert said['marks']['total_error_deg']['value'] < 1e-7
-    assert any('bias, as the parameters of the log say' in note for note in said['notes']) == (
-        '--imu' in options)
+    assert any('up to the first event, at 4.000000000 s' in note for note in said['notes'])
+    assert main([path, '--topic', '/imu/data_raw']) == ('--imu' in options)
+    assert ('bias: gyroscope' in capsys.readouterr().out) == ('--imu' in options)
     assert main([path, '-p', 'imu.rpy:=[0.0, 0.0, 0.0]']) == 1
     assert 'mounting: gyroscope: the readings are in axes that are turned by' in (
         capsys.readouterr().out)
