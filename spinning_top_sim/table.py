@@ -78,7 +78,9 @@ def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
             from pyarrow import parquet  # noqa: PLC0415
         table = parquet.read_table(path)
         columns = {name: table[name].to_numpy() for name in table.column_names}
-    elif kind == '.npz' and is_zipfile(path):
+    elif kind == '.npz':
+        if not is_zipfile(path):
+            raise ValueError('it is no file of numpy.savez')
         with np.load(path, allow_pickle=False) as arrays:
             columns = {name: np.atleast_1d(values) for name, values in arrays.items()}
     else:
@@ -92,10 +94,10 @@ def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
 def _text(path: Path) -> tuple[Columns, Sequence[str]]:
     """Read columns between commas, semicolons, tabs or spaces; # begins a comment."""
     try:
-        lines = path.read_text('utf-8-sig').splitlines()
+        lines = [line.strip(' ') for line in path.read_text('utf-8-sig').splitlines()]
     except UnicodeDecodeError as error:
-        raise ValueError('it is no text in UTF-8: convert it, such as by iconv') from error
-    bare = ['' if line[:1] == '#' else line.strip(' ') for line in lines]
+        raise ValueError('it is no text in UTF-8: convert it, as by iconv -f latin1') from error
+    bare = ['' if line[:1] == '#' else line for line in lines]
     first = next(filter(str.strip, bare), '')
     mark = next((mark for mark in ',;\t' if mark in first), ' ')
 
@@ -113,7 +115,7 @@ def _text(path: Path) -> tuple[Columns, Sequence[str]]:
     for where, row in rows.items():
         if len(row) != len(names):
             raise ValueError(f'{where} has {len(row)} values, and there are {len(names)} columns: '
-                             'must be as many, with decimal points')
+                             'must be as many, with decimal points; comments begin with #')
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f'two columns are called {twice[0]}: each needs a name of its own')
     return {name: [row[k] for row in rows.values()] for k, name in enumerate(names)}, [*rows]

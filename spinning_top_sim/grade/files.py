@@ -7,6 +7,7 @@ What is not understood is refused in one line, with what to type.
 """
 
 import contextlib
+import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -36,8 +38,8 @@ PARTS: dict[str, tuple[Sequence[str], Mapping[str, Any]]] = {
     **{name: ([f'{letter}{axis}' for axis in 'xyz'], READINGS[name])
        for name, letter in zip(READINGS, 'gam', strict=True)}}
 UNITS = {name: units for names, units in PARTS.values() for name in names}
-# Brackets and what is behind them; a unit in them, but no index; what resembles one of our names.
-REST = re.compile(r'\s*[\[({].*')
+# The end of a name in brackets; a unit in them, no index; what resembles one of our names; dates.
+BRACKETS = re.compile(r'\s*[\[({][^\])}]*[\])}]$')
 UNIT = re.compile(r'[\[({](?!\d+\W)([^\])}]*)[\])}]$')
 ALIKE = re.compile(r'(?<![a-z0-9])([pqgam])[^a-z0-9]?([wxyz])(?![a-z0-9])')
 DATE = re.compile(r'^(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(\.\d+)?(Z|[-+]\d\d:?\d\d)?$')
@@ -129,7 +131,7 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
         elif euroc:
             for name in ('state_groundtruth_estimate0', 'imu0'):
                 table, rows = read_columns(euroc / name / 'data.csv')
-                unused += _add(recorded, {EUROC.get(REST.sub('', column), column): cells
+                unused += _add(recorded, {EUROC.get(BRACKETS.sub('', column), column): cells
                                           for column, cells in table.items()}, rows, {})
         else:
             table, rows = read_columns(path)
@@ -144,7 +146,7 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
             if times[0] > last or times[-1] < first:
                 raise ValueError(f'{name} from {times[0]:.6g} to {times[-1]:.6g} s, attitudes '
                                  f'from {first:.6g} to {last:.6g} s: must be of one clock')
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, csv.Error, BadZipFile) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error
     if READINGS.keys().isdisjoint(recorded.parts):
         recorded.notes.append('no readings: the IMU is not graded')
@@ -225,7 +227,7 @@ def _chosen(columns: Columns, said: Chosen, wanted: Sequence[str]) -> Chosen:
     for column in columns:
         if like := ALIKE.search(column.lower()):
             alike.setdefault(like[1] + like[2], []).append(column)
-        name = REST.sub('', column)
+        name = BRACKETS.sub('', column)
         if name in UNITS and name not in said:
             with contextlib.suppress(ValueError):       # of an unknown unit
                 chosen[name] = [_column(name, column), *chosen.get(name, ())]
@@ -236,8 +238,9 @@ def _chosen(columns: Columns, said: Chosen, wanted: Sequence[str]) -> Chosen:
     if unclear:
         items = (f'{name}={" or ".join(alike.get(name, ["COLUMN"]))}:UNIT' for name in unclear)
         units = dict.fromkeys(', '.join(UNITS[name]) for name in unclear)
-        raise ValueError(f"say --columns '{', '.join(items)}', or NAME= for none, with a UNIT of "
-                         f'{"; ".join(units)}; the file has {", ".join(columns)}')
+        raise ValueError(f"say --columns '{', '.join(items)}', each UNIT one of "
+                         f"{'; '.join(units)}; or leave a part out, such as 'ax=, ay=, az='; the "
+                         f'file has {", ".join(columns)}')
     return chosen
 
 
