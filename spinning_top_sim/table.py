@@ -70,28 +70,32 @@ def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
 
     Columns without a name are 'column 1', ...  Raises OSError, ImportError or ValueError.
     """
-    kind, columns = path.suffix.lower(), dict[str, Any]()
+    kind, rows = path.suffix.lower(), list[str]()
     if kind in ('.csv', '.txt', '.tum', '.tsv'):
-        return _text(path)
-    if kind == '.parquet':
+        names, columns, rows = _text(path)
+    elif kind == '.parquet':
         with needed('a Parquet file', 'parquet'):
             from pyarrow import parquet  # noqa: PLC0415
         table = parquet.read_table(path)
-        columns = {name: table[name].to_numpy() for name in table.column_names}
+        names, columns = table.column_names, [one.to_numpy() for one in table.columns]
     elif kind == '.npz':
         if not is_zipfile(path):
             raise ValueError('it is no file of numpy.savez')
         with np.load(path, allow_pickle=False) as arrays:
-            columns = {name: np.atleast_1d(values) for name, values in arrays.items()}
+            names, columns = [*arrays], [np.atleast_1d(one) for one in arrays.values()]
     else:
         raise ValueError('must be .mcap, or a table .csv, .txt, .tum, .tsv, .parquet or .npz')
-    lengths = {len(column) for column in columns.values()}
-    if len(lengths) != 1:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'two columns are called {name}: each needs a name of its own')
+    lengths = {len(column) for column in columns}
+    if len(lengths) > 1:
         raise ValueError(f'columns have {sorted(lengths)} rows: must have as many')
-    return columns, [f'row {k}' for k in range(*lengths)]
+    return dict(zip(names, columns, strict=True)), rows or [
+        f'row {k}' for k in range(max(lengths, default=0))]
 
 
-def _text(path: Path) -> tuple[Columns, Sequence[str]]:
+def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:
     """Read columns between commas, semicolons, tabs or spaces; # begins a comment."""
     try:
         lines = [line.strip(' ') for line in path.read_text('utf-8-sig').splitlines()]
@@ -111,11 +115,9 @@ def _text(path: Path) -> tuple[Columns, Sequence[str]]:
     rows = {f'line {k}': row for k, row in enumerate(cells(bare), 1) if any(row)}
     if rows and names is heads[0]:
         del rows[next(iter(rows))]
-    names = [name or f'column {k}' for k, name in enumerate(names, 1)]
     for where, row in rows.items():
         if len(row) != len(names):
             raise ValueError(f'{where} has {len(row)} values, and there are {len(names)} columns: '
                              'must be as many, with decimal points; comments begin with #')
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f'two columns are called {twice[0]}: each needs a name of its own')
-    return {name: [row[k] for row in rows.values()] for k, name in enumerate(names)}, [*rows]
+    return ([name or f'column {k}' for k, name in enumerate(names, 1)],
+            [[row[k] for row in rows.values()] for k in range(len(names))], [*rows])

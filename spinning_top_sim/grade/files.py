@@ -43,9 +43,9 @@ BRACKETS = re.compile(r'\s*[\[({][^\])}]*[\])}]$')
 UNIT = re.compile(r'[\[({](?!\d+\W)([^\])}]*)[\])}]$')
 ALIKE = re.compile(r'(?<![a-z0-9])([pqgam])[^a-z0-9]?([wxyz])(?![a-z0-9])')
 DATE = re.compile(r'^(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(\.\d+)?(Z|[-+]\d\d:?\d\d)?$')
-# Columns of TUM and our names of them; our names of those of EuRoC without their units.
-TUM = ['timestamp', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw']
-OF_TUM = ['t', 'px', 'py', 'pz', *TUM[4:]]
+# Columns of TUM, maybe without names, and our names; our names of EuRoC's without their units.
+OF_TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
+TUM = ['timestamp', 'tx', 'ty', 'tz', *OF_TUM[4:]], [f'column {k}' for k in range(1, 9)]
 EUROC = {'timestamp': 't [ns]', **{f'{theirs}_{axis}': f'{ours}{axis}' for theirs, ours in (
     ('p_RS_R', 'p'), ('q_RS', 'q'), ('w_RS_S', 'g'), ('a_RS_S', 'a')) for axis in 'wxyz'}}
 # Topics of this package that are graded where its log has them, the first of each kind.
@@ -135,7 +135,7 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
                                           for column, cells in table.items()}, rows, {})
         else:
             table, rows = read_columns(path)
-            if [*table] in (TUM, [f'column {k}' for k in range(1, 9)]) and path.suffix != '.csv':
+            if [*table] in TUM and path.suffix != '.csv' and not columns:
                 table = dict(zip(OF_TUM, table.values(), strict=True))
             unused = _add(recorded, table, rows, columns_said(columns or ''))
         recorded.notes += [f'not used: {", ".join(unused)}'] * bool(unused)
@@ -179,11 +179,8 @@ def _add_log(recorded: Recorded, path: Path, wanted: Sequence[str]) -> list[str]
             raise ValueError(f'{kind} are in {", ".join(here)}: choose by --topic {here[0]}')
         rows = every[here[0]]
         sources.discard(here[0])
-        stamps = [row.stamp_ns for row in rows]
-        if not any(stamps):
-            recorded.notes.append(f'{kind}: headers without a time: that of the log is used')
-            stamps = [row.log_ns for row in rows]
-        recorded.add(kind, here[0], stamps, np.array([row.values for row in rows]),
+        recorded.add(kind, here[0], [row.stamp_ns for row in rows],
+                     np.array([row.values for row in rows]),
                      [f'message {k}' for k in range(len(rows))])
         covariance = rows[0].covariance         # zeros: unknown; the smallest: exact
         if covariance is not None and np.max(covariance) > EXACT_VARIANCE:
@@ -264,22 +261,27 @@ def _add(recorded: Recorded, columns: Columns, rows: Sequence[str], said: Chosen
 
 
 def _numbers(rows: Sequence[str], column: str, cells: Sequence[Any], unit: str) -> Any:
-    """Return a column (n,), of times exactly; empty: NaN.  Raises ValueError."""
-    of_time, found = unit in UNITS['t'], []
+    """Return a column (n,).  Raises ValueError."""
+    found = []
     for row, cell in zip(rows, cells, strict=True):
         text = '' if cell is None else str(cell).strip()
         try:
-            if unit == 'iso':
-                ((day, fraction, zone),) = DATE.findall(text)
-                seconds = int(datetime.fromisoformat(day + (zone or 'Z')).timestamp())
-                number = seconds + Decimal(fraction or 0)
-            else:
-                number = Decimal(text or 'nan')
-            if '_' in text or math.isinf(float(number)) or (of_time and number.is_nan()):
-                raise ValueError
+            found.append(_number(text, unit))
         except (ArithmeticError, ValueError):
             right = 'date such as 2026-01-31T12:00:00.5' if unit == 'iso' else (
-                'number such as -12.5' + " (of dates say --columns 't=COLUMN:iso')" * of_time)
+                'number such as -12.5'
+                + " (of dates say --columns 't=COLUMN:iso')" * (unit in UNITS['t']))
             raise ValueError(f'{row}: {column} = {text[:40]!r}: must be a {right}') from None
-        found.append(number if of_time else float(number))
     return np.array(found)
+
+
+def _number(text: str, unit: str) -> Decimal | float:
+    """Return the number in a cell, of a time exactly; empty: NaN.  Raises ValueError."""
+    if unit == 'iso':
+        ((day, fraction, zone),) = DATE.findall(text)
+        return Decimal(fraction or 0) + int(datetime.fromisoformat(
+            day + (zone or 'Z')).timestamp())
+    number = Decimal(text) if unit in UNITS['t'] else float(text or 'nan')
+    if '_' in text or math.isinf(number) or (math.isnan(number) and unit in UNITS['t']):
+        raise ValueError
+    return number

@@ -39,10 +39,9 @@ PLACES = {
 
 
 class Sample(NamedTuple):
-    """Numbers in a message, its times [ns], and their covariance, if there is one."""
+    """Numbers in a message, its stamp [ns], and their covariance, if there is one."""
 
     stamp_ns: int
-    log_ns: int
     values: list[float]
     covariance: NDArray[np.float64] | None
 
@@ -108,7 +107,7 @@ def samples(reader: LogReader, end_ns: int) -> dict[str, dict[str, list[Sample]]
                 covariance = getattr(one, f'{place}_covariance', None)
                 if covariance is None or covariance[0] != NO_ORIENTATION:   # there is a reading
                     vector = attrgetter(place)(one)
-                    found[part][source].append(Sample(stamp, message.log_time, [
+                    found[part][source].append(Sample(stamp, [
                         getattr(vector, axis) for axis in 'xyzw' if hasattr(vector, axis)],
                         covariance))
     return found
