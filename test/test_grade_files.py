@@ -125,7 +125,7 @@ TEXT = 't,qw,qx,qy,qz,gx,gy,gz\n' + ''.join(f'{k / 100},1,0,0,0,{k},2,3\n' for k
     ('', '', 'gx=gx:rpm/s', 'unit must be one of rad/s, mrad/s, deg/s, dps, rpm'),
     *(('', '', said, 'must be NAME=COLUMN:UNIT, with each NAME once, of t, qx')
       for said in ('speed=gx', 'gx=gx,gx=gy')),
-    ('gx,gy,gz', 'wx,wy,wz', None, "readings (--columns 'gx=COLUMN:UNIT, ...'); times of t:s; the f"),
+    ('gx,gy,gz', 'wx,wy,wz', None, "readings (--columns 'gx=COLUMN:UNIT, ...'); times of t:s"),
     (',3\n', ',3,4\n', None, 'line 2 has 9 values, and there are 8 columns'),
     (TEXT[:23], '', None, 'the file has column 1, column 2, column 3'),
     ('gy', 'gx', None, 'two columns are called gx'),

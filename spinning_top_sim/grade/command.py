@@ -65,8 +65,8 @@ def _run(arguments: argparse.Namespace) -> int:
     of_top = bool(run) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
     parts, at = recorded.parts, recorded.parts['attitudes'][0]
     if not of_top and READINGS.keys().isdisjoint(parts):
-        raise ValueError(f'{arguments.file}: nothing to grade: no top is known (--scene), and no '
-                         f"readings (--columns 'gx=COLUMN:UNIT, ...'); {'; '.join(recorded.notes)}")
+        raise ValueError(f'{arguments.file}: nothing to grade: no top (--scene) and no readings '
+                         f"(--columns 'gx=COLUMN:UNIT, ...'); {'; '.join(recorded.notes)}")
     if of_top and not run:              # the pivot is at rest
         parts = {'positions': (at, np.zeros((len(at), 3))), **parts}
     known = {name: values[name] for name in ('imu.lever_arm', 'mag.field') if run or name in given}
