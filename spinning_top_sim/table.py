@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of true states, as CSV and Parquet; numbers are read back to the last bit."""
+"""
+Tables: those of true states are written as CSV and Parquet, and those of other programs are read.
 
+Numbers are read back to the last bit.
+"""
+
+import csv
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +19,8 @@ from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
 
 FilePath = str | Path
+Columns = Mapping[str, Sequence[Any]]           # numbers, or texts, by name
+NUMBER = re.compile(r'[-+]?[\d.]+([eE][-+]?\d+)?')
 
 # Names and units of the columns of a table; the second one is for a pivot that moves.
 UNITS = {
@@ -53,3 +62,62 @@ def write_parquet(path: FilePath, blocks: Iterable[NDArray[np.float64]],
           parquet.ParquetWriter(file, schema) as writer):
         for rows in blocks:
             writer.write_table(pa.table(list(rows.T), schema=schema))
+
+
+def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
+    """
+    Return the columns of a table, and what its rows are called, such as 'line 2'.
+
+    Columns without a name are 'column 1', ...  Raises OSError, ImportError or ValueError.
+    """
+    kind, rows = path.suffix.lower(), list[str]()
+    if kind in ('.csv', '.txt', '.tum', '.tsv'):
+        names, columns, rows = _text(path)
+    elif kind == '.parquet':
+        with needed('a Parquet file', 'parquet'):
+            from pyarrow import parquet  # noqa: PLC0415
+        table = parquet.read_table(path)
+        names, columns = table.column_names, [one.to_numpy() for one in table.columns]
+    elif kind == '.npz':
+        if not is_zipfile(path):
+            raise ValueError('it is no file of numpy.savez')
+        with np.load(path, allow_pickle=False) as arrays:
+            names, columns = [*arrays], [np.atleast_1d(one) for one in arrays.values()]
+    else:
+        raise ValueError('must be .mcap, or a table .csv, .txt, .tum, .tsv, .parquet or .npz')
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'two columns are called {name}: each needs a name of its own')
+    lengths = {len(column) for column in columns}
+    if len(lengths) > 1:
+        raise ValueError(f'columns have {sorted(lengths)} rows: must have as many')
+    return dict(zip(names, columns, strict=True)), rows or [
+        f'row {k}' for k in range(max(lengths, default=0))]
+
+
+def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:
+    """Read columns between commas, semicolons, tabs or spaces; # begins a comment."""
+    try:
+        lines = [line.strip(' ') for line in path.read_text('utf-8-sig').splitlines()]
+    except UnicodeDecodeError as error:
+        raise ValueError('it is no text in UTF-8: convert it, as by iconv -f latin1') from error
+    bare = ['' if line[:1] == '#' else line for line in lines]
+    first = next(filter(str.strip, bare), '')
+    mark = next((mark for mark in ',;\t' if mark in first), ' ')
+
+    def cells(lines: Sequence[str]) -> list[list[str]]:
+        return [[*map(str.strip, row)]
+                for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)]
+
+    heads = cells([first, *(line.strip('# ') for line in lines if line[:1] == '#')])
+    names = next((head for head in heads if len(head) == len(heads[0])
+                  and not any(map(NUMBER.fullmatch, head))), [''] * len(heads[0]))
+    rows = {f'line {k}': row for k, row in enumerate(cells(bare), 1) if any(row)}
+    if rows and names is heads[0]:
+        del rows[next(iter(rows))]
+    for where, row in rows.items():
+        if len(row) != len(names):
+            raise ValueError(f'{where} has {len(row)} values, and there are {len(names)} columns: '
+                             'must be as many, with decimal points; comments begin with #')
+    return ([name or f'column {k}' for k, name in enumerate(names, 1)],
+            [[row[k] for row in rows.values()] for k in range(len(names))], [*rows])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
-from spinning_top_sim.grade.logs import read_log
+from spinning_top_sim.grade.files import read
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.tools.simulate import main as simulate
@@ -96,7 +96,7 @@ def test_a_chunk_that_cannot_be_read_is_noted_here_and_by_grade(log, tmp_path):
     for path, notes in ((log, []), (damaged, ['the log is damaged: what is whole is read'])):
         report = examine_log(path, 'imu/data')
         assert report.passed and report.notes == notes
-        assert [note for note in read_log(path).notes if 'damaged' in note] == notes
+        assert [note for note in read(path).notes if 'damaged' in note] == notes
 
 
 @pytest.mark.parametrize('type_name', TYPES)

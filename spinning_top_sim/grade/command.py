@@ -27,9 +27,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
-from spinning_top_sim.grade import files, grade_readings
+from spinning_top_sim.grade.bodies import grade_readings
 from spinning_top_sim.grade.columns import DENSITIES, READINGS, STANDARD_GRAVITY, Imu
-from spinning_top_sim.grade.logs import read_log
+from spinning_top_sim.grade.files import Recorded, read
 from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.grade.simulators import EARLY, TOLERANCE, Judgement
 from spinning_top_sim.solvers.vertical import state_of
@@ -41,14 +41,6 @@ from spinning_top_sim.tools.report import Finding, Mark, Report, printed
 
 START = 0.02            # angle to the start that is given, beyond which there is another [rad]
 NOISES = 5.0            # standard deviations of noise by which an attitude may be off besides
-# Errors of a device in our parameters, and faults that they are in the readings of its logs.
-DECLARED = {**{name: {'bias', 'reading_scale', 'matrix', 'inaccurate'} for name in (
-                'turn_on_bias', 'hard_iron', 'soft_iron', 'disturbance')},
-            'bias': {'bias'}, 'random_walk': {'bias'}, 'drop': {'held'}, 'duplicate': {'held'},
-            **{name: {'matrix', 'mounting', 'reading_scale', 'sign'} for name in ('_M', '_A')},
-            **{name: {'late', 'early', 'inaccurate', 'noise_scale', 'acceleration_scale',
-                      'reading_scale', 'matrix', 'finite_differences'} for name in (
-                'stamp', 'clock', 'bandwidth', 'sampling', 'vibration', 'range', 'resolution')}}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,75 +58,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    path, log = arguments.file, arguments.file.suffix == '.mcap'
-    if path.is_dir():
-        path = path / 'mav0' if (path / 'mav0').is_dir() else path
-        log = not (path / 'imu0').is_dir()
-    if (arguments.columns if log else arguments.topic):
-        raise ValueError('--columns is for tables' if log else '--topic is for logs')
-    recorded = read_log(path, arguments.topic) if log else files.read_table(
-        path, arguments.columns)
-    given = scene_file.given(arguments)
-    known = None if arguments.scene or arguments.params else recorded.run
-    values = parameters.checked({**(known.values_in_effect if known else {}), **given})
-    of_top = bool(known) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
+    recorded = read(arguments.file, arguments.columns, arguments.topic)
+    given: Mapping[str, Any] = scene_file.given(arguments)
+    run = None if arguments.scene or arguments.params else recorded.run
+    values = parameters.checked({**(run.values_in_effect if run else {}), **given})
+    of_top = bool(run) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
     parts, at = recorded.parts, recorded.parts['attitudes'][0]
     if not of_top and READINGS.keys().isdisjoint(parts):
-        raise ValueError(f'{path}: there are no readings, and no top is known (--scene): nothing '
-                         f'to grade; {"; ".join(recorded.notes)}; readings are named by --columns '
-                         "'gx=COLUMN:UNIT, ...'")
-    if of_top and not known:            # the pivot is at rest
+        raise ValueError(f'{arguments.file}: nothing to grade: no top (--scene) and no readings '
+                         f"(--columns 'gx=COLUMN:UNIT, ...'); {'; '.join(recorded.notes)}")
+    if of_top and not run:              # the pivot is at rest
         parts = {'positions': (at, np.zeros((len(at), 3))), **parts}
-    report = Report(path.name, [], {}, recorded.notes).plus(grade_readings(
-        parts, _imu(arguments, given, values, bool(known), recorded.densities),
-        gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY))
-    if known:
-        report = _without_declared(report, known.values_in_effect)
+    known = {name: values[name] for name in ('imu.lever_arm', 'mag.field') if run or name in given}
+    imu = Imu(lever_arm=arguments.lever_arm or known.get('imu.lever_arm'),
+              field=known.get('mag.field'),
+              mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
+              **{name: given.get(f'imu.{name}', recorded.densities.get(kind))
+                 for kind, name in DENSITIES.items()})
+    report = Report(arguments.file.name, notes=recorded.notes).plus(grade_readings(
+        parts, imu, gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY))
     if of_top:
-        report = report.plus(_of_motion(recorded, values, known))
+        report = report.plus(_of_motion(recorded, values, run))
     return printed(report, arguments.json)
 
 
-def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],
-         known: bool, densities: Mapping[str, float]) -> Imu:
-    """Return what is known of the IMU."""
-    arm, field = (tuple(values[name]) if known or name in given else None
-                  for name in ('imu.lever_arm', 'mag.field'))
-    return Imu(
-        lever_arm=tuple(arguments.lever_arm) if arguments.lever_arm else arm, field=field,
-        mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
-        **{name: given.get(f'imu.{name}', densities.get(kind))
-           for kind, name in DENSITIES.items()})
-
-
-def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
-    """Return a report without the errors that the parameters of a log give its device."""
-    defaults = parameters.checked({})
-    ours = [name for name, value in values.items()
-            if name.startswith(('imu.', 'mag.')) and value != defaults[name]]
-    known = set().union(*(faults for part, faults in DECLARED.items()
-                          if any(part in name for name in ours)))
-    return replace(report, found=[one for one in report.found if one.name not in known], notes=[
-        *report.notes, *(f'{one.name}, as the parameters of the log say: {one.evidence}'
-                         for one in report.found if one.name in known)])
-
-
-def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) -> Report:
+def _of_motion(recorded: Recorded, values: Mapping[str, Any], run: Any) -> Report:
     """Return a report on the motion of a top beside the exact one."""
     bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
     body = max(bodies, key=lambda one: len(one.t), default=None)
     tolerance, notes = TOLERANCE + NOISES * (body.sigma['attitudes'] if body else math.inf), []
     if not body or body.coarse or tolerance > MOST:
         return Report('', unjudged=['the motion: too few poses, or too much noise'])
-    if run is not None:                 # its own exact motion, its moving pivot included
-        first_ns = float(recorded.origin * 10 ** 9 - run.epoch_ns)
+    if run:                             # its own exact motion, its moving pivot included
         motion = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory
-        truth = motion.evaluate(np.rint(1e9 * body.t + first_ns).astype(np.int64)).quaternion
-        worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
-        found = [Finding('inaccurate', f'the attitude is up to {math.degrees(worst):.3g} deg off',
-                         math.degrees(worst))] if worst > tolerance else []
-        return Report('', found, {'total_error_deg': Mark(math.degrees(worst),
-                                                          math.degrees(tolerance))})
+        stamps = np.rint(1e9 * body.t).astype(np.int64) + (recorded.origin - run.epoch_ns)
+        truth = Rotation.from_quat(motion.evaluate(stamps).quaternion)
+        worst = math.degrees(np.max((truth.inv() * body.rotation).magnitude()))
+        limit = math.degrees(tolerance)
+        found = [Finding('inaccurate', f'the attitude is up to {worst:.3g} deg off', worst)]
+        return Report('', found * (worst > limit), {'total_error_deg': Mark(worst, limit)})
     top = Body(**vars(parameters.top_of(values)))
     start, told = Start.of(top, parameters.start_state(values)), body.rotation.as_quat()
     body = replace(body, t=body.t - body.t[0])

@@ -2,7 +2,7 @@
 """Reads the messages of other programs, and poses and readings in them, by rosbags."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
 from functools import cache
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -39,12 +39,9 @@ PLACES = {
 
 
 class Sample(NamedTuple):
-    """Numbers in a message: their kind, as in PLACES, source and stamp [ns], 0: it has none."""
+    """Numbers in a message, its stamp [ns], and their covariance, if there is one."""
 
-    kind: str
-    source: str             # topic, of transforms TOPIC:CHILD
     stamp_ns: int
-    log_ns: int
     values: list[float]
     covariance: NDArray[np.float64] | None
 
@@ -86,12 +83,16 @@ def decode(data: bytes, type_name: str) -> tuple[int, list[float], NDArray[np.fl
     return stamp.sec * NANOSECONDS + stamp.nanosec, [q.x, q.y, q.z, q.w], covariance
 
 
-def samples(reader: LogReader, types: Mapping[str, str], end_ns: int) -> Iterator[Sample]:
+def samples(reader: LogReader, end_ns: int) -> dict[str, dict[str, list[Sample]]]:
     """
-    Yield poses and readings of topics by their types, of PLACES, up to a log time.
+    Return poses and readings by kind, as in PLACES, and topic, of transforms TOPIC:CHILD.
+
+    end_ns : log time up to which they are read
 
     Raises LogError.
     """
+    types = {topic.name: topic.type_name for topic in reader.topics if topic.type_name in PLACES}
+    found: dict[str, dict[str, list[Sample]]] = defaultdict(lambda: defaultdict(list))
     for message in reader.messages(types, end=end_ns):
         kind = types[message.topic]
         try:
@@ -106,6 +107,7 @@ def samples(reader: LogReader, types: Mapping[str, str], end_ns: int) -> Iterato
                 covariance = getattr(one, f'{place}_covariance', None)
                 if covariance is None or covariance[0] != NO_ORIENTATION:   # there is a reading
                     vector = attrgetter(place)(one)
-                    yield Sample(part, source, stamp, message.log_time, [
+                    found[part][source].append(Sample(stamp, [
                         getattr(vector, axis) for axis in 'xyzw' if hasattr(vector, axis)],
-                        covariance)
+                        covariance))
+    return found
