@@ -182,10 +182,10 @@ class TransportMotion(SteppedMotion):
 
     def _unwrap(self) -> None:
         """Follow the phases to the begins of all steps that are kept."""
-        new = self._kept[self._phases_at_steps.shape[1]:]
+        new = self._knots[self._phases_at_steps.shape[1]:]
         if new:
-            t = np.array([step.t0 for step in new])
-            y = tuple(components([step.y0 for step in new]))
+            times, vectors, _ = zip(*new, strict=True)
+            t, y = np.array(times), tuple(components(vectors))
             phases = self.phases(y, self.uniform_rates[0] * t)
             self._phases_at_steps = np.concatenate((self._phases_at_steps, [
                 phase + math.tau * np.cumsum(turns_to_follow(
