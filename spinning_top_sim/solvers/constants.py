@@ -38,7 +38,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
+from gmpy2 import asin, asinh, const_pi, mpc, mpfr, rint, sin_cos, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -104,8 +104,7 @@ class ThetaMotion(NamedTuple):
         whole = int(rint(quarters))
         y = const_pi() / 2 * (
             (self.start_whole - whole) + self.quarter_rate * t + self.start_offset)
-        point = theta.point_of(sinh(self.stretch * y) if self.stretch else sin_cos(y)[0],
-                               bool(self.stretch))
+        point, twice = (theta.point(angle, self.stretch) for angle in (y, 2 * y))
 
         def times_d(factor: Factor) -> mpc:
             real, imag = (part.at(point) for part in factor.parts[whole % 2])
@@ -116,7 +115,7 @@ class ThetaMotion(NamedTuple):
 
         alpha, beta = times_d(self.alpha), times_d(self.beta)
         d2 = abs(alpha) ** 2 + abs(beta) ** 2
-        u_dot = self.turning[whole % 2].u_dot * self.theta1.at(theta.doubled(point)) / d2 ** 2
+        u_dot = self.turning[whole % 2].u_dot * self.theta1.at(twice) / d2 ** 2
         return alpha / sqrt(d2), beta / sqrt(d2), u_dot
 
 
@@ -165,13 +164,12 @@ class _Side(NamedTuple):
 
 
 class _Nutation(NamedTuple):
-    """Theta functions, the rate of their y [rad/s], and N, y and its point at t = 0."""
+    """Theta functions, the rate of their y [rad/s], and N and y at t = 0."""
 
     form: ThetaForm
     y_rate: mpfr
     start_whole: int
     y0: mpfr
-    start: theta.Point
 
 
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
@@ -221,20 +219,24 @@ def _nutating(sides: Sequence[_Side], cubic: tuple[mpfr, mpfr, mpfr, mpfr], mirr
     # sn^2(chi) = low/gap21 and sn^2(K - chi) are equal at sn^2 (1 + sqrt(m1)) = 1.
     odd = low * sqrt(m1) >= high
     sin = form.amplitude(odd, low, high, roots.y3)
-    start = theta.point_of(sin if odd == falling else -sin, bool(form.stretch))
-    nutation = _Nutation(form, sqrt(f3) * form.y_per_root_f3,
-                         (-1 if falling else 1) if odd else 0, form.y_of(start), start)
+    y0 = asinh(sin) / form.stretch if form.stretch else asin(sin)
+    nutation = _Nutation(form, sqrt(f3) * form.y_per_root_f3, (-1 if falling else 1) if odd else 0,
+                         y0 if odd == falling else -y0)
     poles = _poles(pair, roots, f3)
     alpha, beta = [_quotient(nutation, side, pole, is_beta) for side, pole, is_beta in zip(
         pair, poles, (False, True), strict=True)][::mirror]
-    turn = (pair[1].pole_rate - pair[0].pole_rate) * roots.gap21
-    swing_rate = mirror * sqrt(f3 * roots.gap31) / 2 * roots.gap21       # w (u2 - u1)
-    even, odd_ = (_turning_point(sides, [abs(pole[k]) for pole in poles][::mirror], turn * rise,
-                                 swing_rate * slope)
-                  for k, (rise, slope) in enumerate(zip(
-                      form.rises_of_sn2(), form.slopes_of_sn2(), strict=True)))
+    turn = pair[1].pole_rate - pair[0].pole_rate        # -L3/lambda1
+    x_rate = mirror * nutation.y_rate * (form.stretch or 1)
+
+    def turning_point(k: int, rise: mpfr, middle: mpfr) -> TurningPoint:
+        swing = roots.gap21 * rise          # of u
+        return _turning_point(sides, [abs(pole[k]) for pole in poles][::mirror], turn * swing,
+                              swing * middle ** 2 * form.slope1 * x_rate)
+
+    even, odd_ = form.rises_of_sn2()
     return ThetaMotion(
-        alpha, beta, (even, odd_), form.theta1, form.stretch,
+        alpha, beta, (turning_point(0, even, form.middle4), turning_point(1, odd_, form.middle3)),
+        form.theta1, form.stretch,
         2 * nutation.y_rate / const_pi(), nutation.start_whole, 2 * nutation.y0 / const_pi(), m1,
         form.size)
 
@@ -261,7 +263,7 @@ def _poles(pair: Sequence[_Side], roots: mp.Roots, f3: mpfr) -> tuple[theta.Plac
 
 def _quotient(nutation: _Nutation, side: _Side, pole: theta.Place, is_beta: bool) -> Factor:
     """Return alpha or beta as a quotient of theta functions."""
-    form, y_rate, start_whole, y0, start = nutation
+    form, y_rate, start_whole, y0 = nutation
     sense, drift, to_pole = sign_of(side.pole_rate), mp.ZERO, max(abs(pole[0]), abs(pole[1]))
     rate, scale = side.half_spin, sqrt(to_pole / 2)
     if 0 < scale < LEAST_AMPLITUDE:
@@ -284,6 +286,7 @@ def _quotient(nutation: _Nutation, side: _Side, pole: theta.Place, is_beta: bool
     scale *= (form.middle4 if is_beta else form.middle3) / second[0].leading
     at_even, at_odd = (second, first) if is_beta else (first, second)
     here, argument = (at_odd if start_whole % 2 else at_even), drift * y0
+    start = theta.point(y0, form.stretch)
     if sense:
         real, imag = (part.at(start) for part in here)
         argument += mp.atan2(imag, real)

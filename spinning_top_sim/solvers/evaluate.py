@@ -234,12 +234,6 @@ class ExactStates(States):
 
     @cached_property
     def theta_dot(self) -> Column:
-        theta_dot: Column = self._arrays.sign * self.tilt_rate
-        return theta_dot
-
-    @cached_property
-    def tilt_rate(self) -> Column:
-        """The rate of theta in [0, pi] [rad/s], continued through a pole that is passed."""
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
         if not arrays.u_dot.any():      # it rests, perhaps at a pole
@@ -254,7 +248,7 @@ class ExactStates(States):
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
         rate: Column = -arrays.u_dot.take(self._parity) * (series / size) / (
             without[0] * without[1])
-        return rate
+        return arrays.sign * rate
 
     @cached_property
     def across(self) -> Column:
@@ -288,8 +282,9 @@ class ExactStates(States):
         cos, sin = real / moduli, imag / moduli
         for k in self._arrays.on_line:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
-        return attitude.transverse(self.tilt_rate, self.across, cos[0] * cos[1] + sin[0] * sin[1],
-                                   sin[0] * cos[1] - cos[0] * sin[1])
+        return attitude.transverse(
+            self._arrays.sign * self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
+            sin[0] * cos[1] - cos[0] * sin[1])
 
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:

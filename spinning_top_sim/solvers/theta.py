@@ -15,7 +15,7 @@ from functools import reduce
 from itertools import count, zip_longest
 from operator import add, mul
 
-from gmpy2 import agm, asinh, const_pi, exp, frexp, get_context, mpfr, sqrt
+from gmpy2 import agm, const_pi, exp, frexp, get_context, mpfr, sin_cos, sinh, sqrt
 
 from spinning_top_sim.solvers.multiprecision import (
     BITS,
@@ -23,7 +23,6 @@ from spinning_top_sim.solvers.multiprecision import (
     ZERO,
     DigitsLostError,
     Roots,
-    atan2,
 )
 
 # What the terms of a series have in common: one of the four prefactors 1, cos y, sin y and
@@ -57,30 +56,25 @@ MULTIPLE_ANGLES = [_multiple_angles(*pair) for pair in FIRST_POLYNOMIALS]
 Point = tuple[mpfr, mpfr, mpfr]
 
 
-def point_of(sin: mpfr, imaginary: bool) -> Point:
-    """Return the point with sin y, or sinh x, and cos y or cosh x > 0."""
-    xi = -sin * sin if imaginary else sin * sin
+def point(y: mpfr, stretch: mpfr) -> Point:
+    """Return the point of y, |y| <= pi/2; `stretch` is that of a `ThetaForm`."""
+    sin = sinh(stretch * y) if stretch else sin_cos(y)[0]
+    xi = -sin * sin if stretch else sin * sin
     return sin, sqrt(1 - xi), xi
-
-
-def doubled(point: Point) -> Point:
-    """Return the point of 2y or 2x."""
-    sin, cos, xi = point
-    return 2 * sin * cos, 1 - 2 * xi, 4 * xi * (1 - xi)
 
 
 class Series:
     """The sum of weights[k] times cos(n y) or sin(n y): a prefactor and a polynomial in xi."""
 
     def __init__(self, prefactor: int, weights: Sequence[mpfr]) -> None:
-        self.prefactor, self.weights = prefactor, weights
+        self.prefactor, self._weights = prefactor, weights
 
     def scaled(self, factor: mpfr) -> 'Series':
-        return Series(self.prefactor, [factor * x for x in self.weights])
+        return Series(self.prefactor, [factor * x for x in self._weights])
 
     def polynomial(self, terms: int) -> list[mpfr]:
         """Return the coefficients of xi^0, xi^1 ... of the first terms."""
-        weights = self.weights[:terms]
+        weights = self._weights[:terms]
         # A sum of -0 is -0.
         return [reduce(add, map(mul, weights[power:], shapes)) for power, shapes in zip(
             range(len(weights)), MULTIPLE_ANGLES[self.prefactor], strict=False)]
@@ -88,14 +82,14 @@ class Series:
     @property
     def leading(self) -> mpfr:
         """At y = 0, the value of a cosine series, or the derivative of a sine series."""
-        return reduce(add, map(mul, self.weights, MULTIPLE_ANGLES[self.prefactor][0]))
+        return reduce(add, map(mul, self._weights, MULTIPLE_ANGLES[self.prefactor][0]))
 
     def at(self, point: Point) -> mpfr:
         """Return the sum."""
         sin, cos, xi = point
         (before, *_), (constant, slope) = FIRST_POLYNOMIALS[self.prefactor]
         now, factor, value = constant + slope * xi, 2 - 4 * xi, ZERO
-        for weight in self.weights:
+        for weight in self._weights:
             value += weight * before
             before, now = now, factor * now - before
         return value * (ONE, cos, sin, sin * cos)[self.prefactor]
@@ -161,10 +155,6 @@ class ThetaForm:
             one.leading for one in (self.theta1, self.theta3, self.theta4))
         self.odd_over_even = 4 * sqrt(q) if imaginary else ONE
 
-    def y_of(self, point: Point) -> mpfr:
-        sin, cos, _ = point
-        return asinh(sin) / self.stretch if self.stretch else atan2(sin, cos)
-
     def amplitude(self, odd: bool, above1: mpfr, below2: mpfr, below3: mpfr) -> mpfr:
         """
         Return |sin y|, or |sinh x|, where cos(theta) is above u1 and below u2 and u3 by so much.
@@ -192,16 +182,9 @@ class ThetaForm:
         # The square may be 1 but for rounding: the sine is then 1.
         return min(self._mean / h, ONE) if square > 0 else self._mean / h
 
-    def slopes_of_sn2(self) -> tuple[mpfr, mpfr]:
-        """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
-        # 2 sn cn dn by the quotients of DLMF 22.2 and the duplication of theta1 [DLMF 20.7.10];
-        # c from the first term at y = 0, where chi = (2K/pi) y.
-        even = self.middle4 ** 4 * self._a / (self._mean * self.slope1)
-        return even, -even * self.odd_over_even ** 2
-
     def rises_of_sn2(self) -> tuple[mpfr, mpfr]:
         """Return c with sn^2 chi - sn^2(N K) = c theta1(y)^2/D(y)^2, at even and at odd N."""
-        size = (self._a / (self._mean * self.slope1)) ** 2
+        size = (self._a / (self._mean * self.slope1)) ** 2      # chi is (2K/pi) y
         return (size * self.middle4 ** 2,
                 -size * self.middle3 ** 2 * self._roots.gap32 / self._roots.gap31)
 
