@@ -46,7 +46,7 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers import multiprecision as mp
 from spinning_top_sim.solvers import theta
 from spinning_top_sim.solvers.theta import ThetaForm
-from spinning_top_sim.solvers.vertical import PreciseState
+from spinning_top_sim.solvers.vertical import Posture
 
 BITS_TO_TRY = mp.BITS, 2 * mp.BITS, 4 * mp.BITS, 8 * mp.BITS
 # Smaller amplitudes leave no room for their squares in doubles.
@@ -119,13 +119,7 @@ class ThetaMotion(NamedTuple):
         return alpha / sqrt(d2), beta / sqrt(d2), u_dot
 
 
-def precise(start: State | PreciseState) -> PreciseState:
-    """Return a state in multiprecision."""
-    return (start if isinstance(start, PreciseState)
-            else PreciseState.of(start, mpfr, sin_cos))
-
-
-def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -> ThetaMotion:
+def set_up(top: Top, start: State | Posture, gravity: mpfr | None = None) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
@@ -172,10 +166,11 @@ class _Nutation(NamedTuple):
     y0: mpfr
 
 
-def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
+def _set_up(top: Top, gravity: mpfr, start: State | Posture) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
-    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = precise(start)
+    posture = start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)
+    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = posture.polar(top)
     half_spin = l3 * (1 / lambda3 - 1 / lambda1) / 2
     arguments = [mp.atan2(z.imag, z.real) for z in (alpha, beta)]
     sides = (

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from gmpy2 import mpc, mpfr
+from gmpy2 import mpc, mpfr, sin_cos
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
@@ -25,11 +25,11 @@ from spinning_top_sim.physics.regimes import (
 )
 from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.constants import precise, set_up
+from spinning_top_sim.solvers.constants import set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.multiprecision import precision
-from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
+from spinning_top_sim.solvers.vertical import Posture, Vertical
 from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -70,13 +70,11 @@ class ExactSolution(Motion):
 
     is_exact = True
 
-    def __init__(self, top: Top, start: State | PreciseState,
-                 gravity: mpfr | None = None) -> None:
-        # A motion about another vertical has its start and its `gravity` in multiprecision.
-        super().__init__(top, start if isinstance(start, State) else start.rounded())
+    def __init__(self, top: Top, start: State | Posture, gravity: mpfr | None = None) -> None:
         self._given = start
         with precision():
-            self._motion = motion = set_up(top, self._given, gravity)
+            super().__init__(top, start if isinstance(start, State) else start.polar(top).state())
+            self._motion = motion = set_up(top, start, gravity)
             alpha, beta = motion.alpha, motion.beta
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
@@ -135,16 +133,15 @@ class ExactSolution(Motion):
         They are right to 38 digits, times what the motion makes of such an error.
         """
         with precision():
-            start = precise(self._given)
-            found = start.posture(self.top)
+            found = _precise(self.top, self._given)
             if t_ns:                # perhaps at a pole, where the axis does not tell its rates
                 alpha, beta, u_dot = self._motion.at(mpfr(t_ns) / NANOSECONDS)
                 # omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); where
                 # the axis rests at a pole it is 0.
                 product, transverse = 2 * alpha * beta.conjugate(), mpc(0)
                 if abs(product):        # a zero mpc is true
-                    momentum = precession_momentum(start.l3, start.lz, abs(beta) ** 2,
-                                                   abs(alpha) ** 2)
+                    momentum = precession_momentum(found.l3, found.polar(self.top).lz,
+                                                   abs(beta) ** 2, abs(alpha) ** 2)
                     transverse = -(momentum / mpfr(self.top.lambda1) + 1j * u_dot) / product
                 found = Posture(alpha, beta, transverse, found.l3)
             return vertical.to_world(found) if vertical else found
@@ -154,7 +151,10 @@ def exact_about(top: Top, start: State | Posture,
                 acceleration: Fractions) -> tuple[ExactSolution, Vertical]:
     """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
     with precision():
-        posture = start if isinstance(start, Posture) else precise(start).posture(top)
         vertical = Vertical.of(top, acceleration, mpfr)
-        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture))
-    return ExactSolution(vertical.top, state, vertical.gravity), vertical
+        posture = vertical.to_frame(_precise(top, start))
+    return ExactSolution(vertical.top, posture, vertical.gravity), vertical
+
+
+def _precise(top: Top, start: State | Posture) -> Posture:
+    return start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)

@@ -18,7 +18,7 @@ from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.transport import TransportMotion
-from spinning_top_sim.solvers.vertical import Posture, PreciseState
+from spinning_top_sim.solvers.vertical import Posture
 
 # Doubles do not hold the squares of larger rates [rad/s]; those of the spin are smaller anyway.
 FASTEST_AXIS = 1e100
@@ -62,7 +62,7 @@ def motion_of(top: Top, start: State, *, method: str, equations: str = 'transpor
         if not (isinstance(value, int | float) and least <= value <= 1e-2):
             raise ValueError(f'{name} = {shown(value)}: must be in [{least:g}, 1e-2]')
     try:
-        now = posture or PreciseState.of(start).posture(top)
+        now = posture or Posture.of(top, start)
         if not abs(now.transverse) <= FASTEST_AXIS:
             raise OverflowError
     except ArithmeticError:

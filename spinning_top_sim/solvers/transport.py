@@ -73,7 +73,7 @@ class TransportMotion(SteppedMotion):
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, transverse, _ = posture
+        alpha, beta, transverse, *_ = posture
         # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
         m = 0.5j * (alpha * alpha * transverse - beta * beta * transverse.conjugate()
                     + 2.0 * alpha * beta * (l3 / lambda1))
