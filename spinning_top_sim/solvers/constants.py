@@ -170,7 +170,8 @@ def _set_up(top: Top, gravity: mpfr, start: State | Posture) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
     posture = start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)
-    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = posture.polar(top)
+    sin_half, cos_half, theta_dot, lz, alpha, beta = posture.polar(top)
+    l3 = mpfr(posture.l3)
     half_spin = l3 * (1 / lambda3 - 1 / lambda1) / 2
     arguments = [mp.atan2(z.imag, z.real) for z in (alpha, beta)]
     sides = (

@@ -73,7 +73,7 @@ class ExactSolution(Motion):
     def __init__(self, top: Top, start: State | Posture, gravity: mpfr | None = None) -> None:
         self._given = start
         with precision():
-            super().__init__(top, start if isinstance(start, State) else start.polar(top).state())
+            super().__init__(top, start if isinstance(start, State) else start.state(top))
             self._motion = motion = set_up(top, start, gravity)
             alpha, beta = motion.alpha, motion.beta
             # 2 K/w, two quarter periods
@@ -140,8 +140,8 @@ class ExactSolution(Motion):
                 # the axis rests at a pole it is 0.
                 product, transverse = 2 * alpha * beta.conjugate(), mpc(0)
                 if abs(product):        # a zero mpc is true
-                    momentum = precession_momentum(found.l3, found.polar(self.top).lz,
-                                                   abs(beta) ** 2, abs(alpha) ** 2)
+                    _, _, _, lz, *_ = found.polar(self.top)
+                    momentum = precession_momentum(found.l3, lz, abs(beta) ** 2, abs(alpha) ** 2)
                     transverse = -(momentum / mpfr(self.top.lambda1) + 1j * u_dot) / product
                 found = Posture(alpha, beta, transverse, found.l3)
             return vertical.to_world(found) if vertical else found

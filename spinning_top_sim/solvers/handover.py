@@ -81,7 +81,7 @@ class Piece:
             return exact_about(top, start, self.ride.acceleration)
         vertical = Vertical.of(top, self.ride.acceleration, float)
         posture = vertical.to_frame(posture)
-        state = posture.polar(vertical.top).state()
+        state = posture.state(vertical.top)
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
 

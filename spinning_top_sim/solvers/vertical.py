@@ -36,32 +36,6 @@ def _sin_cos(angle: float) -> tuple[float, float]:
     return math.sin(angle), math.cos(angle)
 
 
-class Polar(NamedTuple):
-    """
-    A posture about some vertical, in polar angles.
-
-    sin_half, cos_half : of theta/2, with theta in [0, pi]
-    alpha, beta : complex numbers of any modulus with the arguments (phi + psi)/2, (phi - psi)/2
-    """
-
-    sin_half: Real
-    cos_half: Real
-    theta_dot: Real
-    alpha: Complex
-    beta: Complex
-    l3: Real
-    lz: Real
-
-    def state(self) -> State:
-        """Return the state in doubles."""
-        alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in (self.alpha, self.beta))
-        theta = 2.0 * math.atan2(float(self.sin_half), float(self.cos_half))
-        pole = pole_momentum(theta, float(self.l3))
-        return State(theta=theta, theta_dot=float(self.theta_dot), phi=alpha + beta,
-                     psi=alpha - beta, l3=float(self.l3),
-                     lz=float(self.lz) if pole is None else pole)
-
-
 class Posture(NamedTuple):
     """
     Attitude and angular velocity at one instant, in any numbers.
@@ -102,9 +76,10 @@ class Posture(NamedTuple):
         return Posture(a * self.alpha - b * self.beta.conjugate(),
                        a * self.beta + b * self.alpha.conjugate(), self.transverse, self.l3)
 
-    def polar(self, top: Top, pole: float = POLE_IN_BITS) -> Polar:
+    def polar(self, top: Top, pole: float = POLE_IN_BITS) -> tuple[Real, ...]:
         """
-        Return polar angles about the same vertical.
+        Return sine and cosine of theta/2, theta' and Lz, about the same vertical, with theta in
+        [0, pi]; and complex numbers with the arguments (phi + psi)/2 and (phi - psi)/2.
 
         A vertical axis has no precession angle of its own: there the angle is that of the line
         about which the axis turns, so that all of this motion is nutation.
@@ -122,15 +97,24 @@ class Posture(NamedTuple):
             turn = -1j * transverse / rate if rate else 1 + 0j      # exp(-i psi)
             none = 0 * sine
             if sine < cosine:
-                return Polar(none, 1 + none, rate, alpha, alpha * turn, l3, l3)
-            return Polar(1 + none, none, rate, beta * turn.conjugate(), beta, l3, -l3)
+                return none, 1 + none, rate, l3, alpha, alpha * turn
+            return 1 + none, none, rate, -l3, beta * turn.conjugate(), beta
         if theta_dot is None or lz is None:
             # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
             # + i theta') exp(-i psi)
             rates = transverse * (alpha * beta.conjugate()) / (cosine * sine * size2)
             theta_dot, lz = rates.imag, (cosine - sine) * (cosine + sine) * l3 - (
                 2 * top.lambda1 * rates.real * cosine * sine)
-        return Polar(sine, cosine, theta_dot, alpha, beta, l3, lz)
+        return sine, cosine, theta_dot, lz, alpha, beta
+
+    def state(self, top: Top, pole: float = POLE_IN_BITS) -> State:
+        """Return the state about the same vertical; the arguments are those of `polar`."""
+        sine, cosine, theta_dot, lz, *numbers = self.polar(top, pole)
+        alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in numbers)
+        theta, l3 = 2.0 * math.atan2(float(sine), float(cosine)), float(self.l3)
+        lz_at_pole = pole_momentum(theta, l3)
+        return State(theta=theta, theta_dot=float(theta_dot), phi=alpha + beta, psi=alpha - beta,
+                     l3=l3, lz=float(lz) if lz_at_pole is None else lz_at_pole)
 
 
 class Vertical(NamedTuple):
@@ -193,4 +177,4 @@ def state_of(top: Top, quaternion: NDArray[np.float64],
     w1, w2, w3 = (float(part) for part in attitude.rotated_back(
         unit, angular_velocity.tolist()))
     posture = Posture(complex(w, z), complex(y, -x), complex(w1, w2), top.lambda3 * w3)
-    return posture.polar(top, POLE_IN_DOUBLES).state()
+    return posture.state(top, POLE_IN_DOUBLES)

@@ -111,7 +111,7 @@ class Trajectory:
         """Return L3, and Lz about the vertical of the world, after a time [kg m^2/s]."""
         piece = self.after(t_ns)
         now = (piece.motion.start if piece.rests
-               else piece.posture(t_ns).in_doubles().polar(self.top))
+               else piece.posture(t_ns).in_doubles().state(self.top))
         return now.l3, now.lz
 
     def starts(self, begin_ns: int, end_ns: int) -> list[int]:
