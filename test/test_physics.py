@@ -57,12 +57,6 @@ def test_a_drift_is_relative_absolute_where_the_constant_is_0_and_finite(start, 
     assert tuple(relative_drift(np.array([-1.0, -2.0, -3.0]), start)) == expected
 
 
-def test_realizable_is_the_triangle_inequality_about_the_centre_of_mass():
-    across = 2.0 * 0.15 ** 2
-    assert Top(**{**TOP, 'lambda1': 0.075 + across}).is_realizable
-    assert not Top(**{**TOP, 'lambda1': 0.0749 + across}).is_realizable
-
-
 @pytest.mark.parametrize('seed', range(20))
 def test_attitude_rates_energy_and_momenta_are_those_of_the_euler_angles(seed):
     """Of random states, by an independent library; the rates are those of the Lagrangian."""

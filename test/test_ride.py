@@ -150,12 +150,6 @@ def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
         piece.states(np.array([reached_ns + S // 10]))
 
 
-def test_the_exact_twin_of_a_piece_has_its_ride():
-    piece, longer = (Piece(TOP, State(theta=0.5, l3=1.6, lz=1.3), 0, ride((0.5, 0, 0))),
-                     ride((0.5, 0, 0))._replace(end_ns=9 * S))
-    assert piece.exact.ride is piece.ride and piece.with_ride(longer).exact.ride is longer
-
-
 def test_joined_states_have_the_columns_of_their_parts():
     """All of them, though the parts have starts, verticals and solvers of their own."""
     parts = [Piece(TOP, State(theta=0.5, theta_dot=0.3, l3=l3, lz=1.3), 0, where,
@@ -175,15 +169,6 @@ def test_joined_states_have_the_columns_of_their_parts():
     for name in columns:
         assert np.array_equal(rows(whole, name), np.concatenate(
             [rows(part, name) for part in parts], axis=-1)), name
-
-
-def test_the_velocity_of_a_point_is_that_of_its_position():
-    start, point = State(theta=0.5, theta_dot=0.3, l3=1.6, lz=1.3), (0.1, -0.2, 0.3)
-    near = Piece(TOP, start, 0, ride((1.0, 2.0, 0.5)), method='exact').states(
-        np.arange(S // 2 - 100_000, S // 2 + 100_001, 100_000))
-    moved = np.diff(np.array(near.position(point))[:, ::2], axis=1)[:, 0] / 2e-4
-    velocity = np.array(attitude.rotated(near.rows_quaternion, near.world_velocity(point)))[:, 1]
-    assert moved == pytest.approx(velocity, abs=1e-6)
 
 
 # The path of the pivot

@@ -131,5 +131,4 @@ class Piece:
         """Return this motion where the pivot has the same acceleration till another end."""
         changed = copy(self)
         changed.ride = ride
-        changed.__dict__.pop('exact', None)     # it has the old ride
         return changed
