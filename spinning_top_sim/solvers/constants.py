@@ -38,7 +38,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gmpy2 import asin, asinh, const_pi, mpc, mpfr, rint, sin_cos, sqrt
+from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -98,8 +98,8 @@ class ThetaMotion(NamedTuple):
     m1: mpfr = mp.ONE
     size: int = theta.MOST_TERMS    # coefficients of each polynomial that doubles need
 
-    def at(self, t: mpfr) -> tuple[mpc, mpc, mpfr]:
-        """Return alpha, beta and u' at t [s], in multiprecision."""
+    def at(self, t: mpfr) -> tuple[mpc, mpc, mpc]:
+        """Return alpha, beta and omega_1 + i omega_2 at t [s], in multiprecision."""
         quarters = self.start_whole + self.start_offset + self.quarter_rate * t
         whole = int(rint(quarters))
         y = const_pi() / 2 * (
@@ -114,9 +114,18 @@ class ThetaMotion(NamedTuple):
             return (real + 1j * imag) * (cos + 1j * sin)
 
         alpha, beta = times_d(self.alpha), times_d(self.beta)
-        d2 = abs(alpha) ** 2 + abs(beta) ** 2
-        u_dot = self.turning[whole % 2].u_dot * self.theta1.at(twice) / d2 ** 2
-        return alpha / sqrt(d2), beta / sqrt(d2), u_dot
+        alpha2, beta2 = abs(alpha) ** 2, abs(beta) ** 2
+        d2, product = alpha2 + beta2, alpha * beta.conjugate()
+        # -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); 0 where the axis rests at a pole
+        u_dot = self.turning[whole % 2].u_dot * self.theta1.at(twice) / d2
+        momentum = self.alpha.pole_rate * beta2 + self.beta.pole_rate * alpha2
+        transverse = -(momentum + 0.5j * u_dot) / product if abs(product) else mpc(0)
+        return alpha / sqrt(d2), beta / sqrt(d2), transverse
+
+
+def precise(top: Top, start: State | Posture) -> Posture:
+    """Return attitude and angular velocity in multiprecision."""
+    return start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)
 
 
 def set_up(top: Top, start: State | Posture, gravity: mpfr | None = None) -> ThetaMotion:
@@ -157,19 +166,10 @@ class _Side(NamedTuple):
         return self.half_spin + self.pole_rate / x if self.pole_rate else self.half_spin
 
 
-class _Nutation(NamedTuple):
-    """Theta functions, the rate of their y [rad/s], and N and y at t = 0."""
-
-    form: ThetaForm
-    y_rate: mpfr
-    start_whole: int
-    y0: mpfr
-
-
 def _set_up(top: Top, gravity: mpfr, start: State | Posture) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
-    posture = start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)
+    posture = precise(top, start)
     sin_half, cos_half, theta_dot, lz, alpha, beta = posture.polar(top)
     l3 = mpfr(posture.l3)
     half_spin = l3 * (1 / lambda3 - 1 / lambda1) / 2
@@ -188,13 +188,12 @@ def _set_up(top: Top, gravity: mpfr, start: State | Posture) -> ThetaMotion:
 
 def _resting(*sides: _Side) -> ThetaMotion:
     """Return the motion with constant theta: alpha = cos(theta/2) exp i(r t + c)."""
-    factors = []
-    for side in sides:
-        parts = theta.Series(theta.COS_EVEN, [side.modulus]), theta.NOTHING
-        factors.append(Factor(side.pole_rate, side.rate(2 * side.modulus ** 2), side.argument,
-                              (parts, parts)))
-    alpha, beta = factors
-    turning = _turning_point(sides, [2 * side.modulus ** 2 for side in sides])
+    x = [2 * side.modulus ** 2 for side in sides]
+    alpha, beta = (
+        Factor(side.pole_rate, side.rate(one), side.argument, (parts, parts))
+        for side, one in zip(sides, x, strict=True)
+        for parts in [(theta.Series(theta.COS_EVEN, [side.modulus]), theta.NOTHING)])
+    turning = _turning_point(sides, x)
     return ThetaMotion(alpha, beta, (turning, turning))
 
 
@@ -210,31 +209,18 @@ def _nutating(sides: Sequence[_Side], cubic: tuple[mpfr, mpfr, mpfr, mpfr], mirr
               falling: bool) -> ThetaMotion:
     """Return a motion; the cubic is its own, with M g R >= 0, or that of its mirror image (-1)."""
     roots, f3, pair = mp.cubic_roots(*cubic), cubic[3], sides[::mirror]
-    form, m1 = ThetaForm(roots), roots.gap32 / roots.gap31
-    low, high = -roots.y1, roots.y2         # u0 - u1 and u2 - u0
-    # sn^2(chi) = low/gap21 and sn^2(K - chi) are equal at sn^2 (1 + sqrt(m1)) = 1.
-    odd = low * sqrt(m1) >= high
-    sin = form.amplitude(odd, low, high, roots.y3)
-    y0 = asinh(sin) / form.stretch if form.stretch else asin(sin)
-    nutation = _Nutation(form, sqrt(f3) * form.y_per_root_f3, (-1 if falling else 1) if odd else 0,
-                         y0 if odd == falling else -y0)
+    form = ThetaForm(roots, sqrt(f3), falling=falling)
     poles = _poles(pair, roots, f3)
-    alpha, beta = [_quotient(nutation, side, pole, is_beta) for side, pole, is_beta in zip(
+    alpha, beta = [_quotient(form, side, pole, is_beta) for side, pole, is_beta in zip(
         pair, poles, (False, True), strict=True)][::mirror]
     turn = pair[1].pole_rate - pair[0].pole_rate        # -L3/lambda1
-    x_rate = mirror * nutation.y_rate * (form.stretch or 1)
-
-    def turning_point(k: int, rise: mpfr, middle: mpfr) -> TurningPoint:
-        swing = roots.gap21 * rise          # of u
-        return _turning_point(sides, [abs(pole[k]) for pole in poles][::mirror], turn * swing,
-                              swing * middle ** 2 * form.slope1 * x_rate)
-
-    even, odd_ = form.rises_of_sn2()
+    even, odd = (
+        _turning_point(sides, [abs(pole[k]) for pole in poles][::mirror], turn * rise,
+                       rise * middle ** 2 * form.slope1 * mirror * form.x_rate)
+        for k, middle, rise in zip((0, 1), (form.middle4, form.middle3), form.rises, strict=True))
     return ThetaMotion(
-        alpha, beta, (turning_point(0, even, form.middle4), turning_point(1, odd_, form.middle3)),
-        form.theta1, form.stretch,
-        2 * nutation.y_rate / const_pi(), nutation.start_whole, 2 * nutation.y0 / const_pi(), m1,
-        form.size)
+        alpha, beta, (even, odd), form.theta1, form.stretch, 2 * form.y_rate / const_pi(),
+        form.start_whole, 2 * form.y0 / const_pi(), roots.gap32 / roots.gap31, form.size)
 
 
 def _poles(pair: Sequence[_Side], roots: mp.Roots, f3: mpfr) -> tuple[theta.Place, theta.Place]:
@@ -257,9 +243,8 @@ def _poles(pair: Sequence[_Side], roots: mp.Roots, f3: mpfr) -> tuple[theta.Plac
     return (-above1, above2, above3), (below1, -below2, u3_minus_one)
 
 
-def _quotient(nutation: _Nutation, side: _Side, pole: theta.Place, is_beta: bool) -> Factor:
+def _quotient(form: ThetaForm, side: _Side, pole: theta.Place, is_beta: bool) -> Factor:
     """Return alpha or beta as a quotient of theta functions."""
-    form, y_rate, start_whole, y0 = nutation
     sense, drift, to_pole = sign_of(side.pole_rate), mp.ZERO, max(abs(pole[0]), abs(pole[1]))
     rate, scale = side.half_spin, sqrt(to_pole / 2)
     if 0 < scale < LEAST_AMPLITUDE:
@@ -271,8 +256,8 @@ def _quotient(nutation: _Nutation, side: _Side, pole: theta.Place, is_beta: bool
         drift = -sense * mp.ONE
         if form.stretch:
             drift += sense * 2 / const_pi() * mp.atan2(amplitude, sqrt(1 - amplitude * amplitude))
-        rate = (side.rate(to_pole) - drift * y_rate
-                - second[1].leading / second[0].leading * y_rate * (form.stretch or 1))
+        rate = (side.rate(to_pole) - drift * form.y_rate
+                - second[1].leading / second[0].leading * form.x_rate)
     elif pole[2]:
         first = form.theta1.scaled(-mp.ONE if is_beta else mp.ONE), theta.NOTHING
         second = form.theta2, theta.NOTHING
@@ -281,16 +266,15 @@ def _quotient(nutation: _Nutation, side: _Side, pole: theta.Place, is_beta: bool
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
     scale *= (form.middle4 if is_beta else form.middle3) / second[0].leading
     at_even, at_odd = (second, first) if is_beta else (first, second)
-    here, argument = (at_odd if start_whole % 2 else at_even), drift * y0
-    start = theta.point(y0, form.stretch)
+    here, argument = (at_odd if form.start_whole % 2 else at_even), drift * form.y0
     if sense:
-        real, imag = (part.at(start) for part in here)
+        real, imag = (part.at(form.start) for part in here)
         argument += mp.atan2(imag, real)
     elif pole[2]:
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
-        flip = 1 if start_whole % 4 < 2 else -1
-        if flip * (here[0].at(start) or here[0].leading * side.slope) < 0:
+        flip = 1 if form.start_whole % 4 < 2 else -1
+        if flip * (here[0].at(form.start) or here[0].leading * side.slope) < 0:
             scale = -scale
     parts = (_scaled(at_even, scale),
              _scaled(at_odd, scale * form.odd_over_even if is_beta else scale))

@@ -132,7 +132,7 @@ class ThetaArrays:
             one.polynomial(motion.size) for row in rows for one in row).reshape(-1, 4, 2)
         self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
-                      if SIN_ODD in pair and k in self.on_line}
+                      if SIN_ODD in pair}
         # (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
         self.pole_rates = [float(factor.pole_rate) for factor in factors]
         self.sense = math.copysign(1.0, start.theta_dot) * self.sign * (len(self.zeros) == 2)

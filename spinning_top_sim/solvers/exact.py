@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from gmpy2 import mpc, mpfr, sin_cos
+from gmpy2 import mpfr
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
@@ -20,12 +20,11 @@ from spinning_top_sim.physics.regimes import (
     Description,
     axis_rests,
     precession_extremes,
-    precession_momentum,
     regime,
 )
 from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.constants import set_up
+from spinning_top_sim.solvers.constants import precise, set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.multiprecision import precision
@@ -133,17 +132,9 @@ class ExactSolution(Motion):
         They are right to 38 digits, times what the motion makes of such an error.
         """
         with precision():
-            found = _precise(self.top, self._given)
+            found = precise(self.top, self._given)
             if t_ns:                # perhaps at a pole, where the axis does not tell its rates
-                alpha, beta, u_dot = self._motion.at(mpfr(t_ns) / NANOSECONDS)
-                # omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); where
-                # the axis rests at a pole it is 0.
-                product, transverse = 2 * alpha * beta.conjugate(), mpc(0)
-                if abs(product):        # a zero mpc is true
-                    _, _, _, lz, *_ = found.polar(self.top)
-                    momentum = precession_momentum(found.l3, lz, abs(beta) ** 2, abs(alpha) ** 2)
-                    transverse = -(momentum / mpfr(self.top.lambda1) + 1j * u_dot) / product
-                found = Posture(alpha, beta, transverse, found.l3)
+                found = Posture(*self._motion.at(mpfr(t_ns) / NANOSECONDS), found.l3)
             return vertical.to_world(found) if vertical else found
 
 
@@ -152,9 +143,5 @@ def exact_about(top: Top, start: State | Posture,
     """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
     with precision():
         vertical = Vertical.of(top, acceleration, mpfr)
-        posture = vertical.to_frame(_precise(top, start))
+        posture = vertical.to_frame(precise(top, start))
     return ExactSolution(vertical.top, posture, vertical.gravity), vertical
-
-
-def _precise(top: Top, start: State | Posture) -> Posture:
-    return start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)

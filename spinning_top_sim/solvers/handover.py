@@ -80,9 +80,7 @@ class Piece:
                 from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
             return exact_about(top, start, self.ride.acceleration)
         vertical = Vertical.of(top, self.ride.acceleration, float)
-        posture = vertical.to_frame(posture)
-        state = posture.state(vertical.top)
-        return motion_of(vertical.top, state, method=method, posture=posture,
+        return motion_of(vertical.top, vertical.to_frame(posture), method=method,
                          **settings), vertical
 
     def states(self, t_ns: Times | range) -> States:

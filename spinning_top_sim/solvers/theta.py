@@ -15,7 +15,7 @@ from functools import reduce
 from itertools import count, zip_longest
 from operator import add, mul
 
-from gmpy2 import agm, const_pi, exp, frexp, get_context, mpfr, sin_cos, sinh, sqrt
+from gmpy2 import agm, asin, asinh, const_pi, exp, frexp, get_context, mpfr, sin_cos, sinh, sqrt
 
 from spinning_top_sim.solvers.multiprecision import (
     BITS,
@@ -110,22 +110,25 @@ class ThetaForm:
     quarter period K is (pi/2) a/M [DLMF 19.8.5].  No step of a mean subtracts numbers of one size.
 
     stretch : K/K' in the imaginary form, where x = stretch y; 0 in the real form
-    y_per_root_f3 : the rate of y over the root of the cubic's leading coefficient
+    y_rate, x_rate : of y, and of x or, in the real form, y again [rad/s]
+    start_whole, y0, start : N and y where the roots are counted from, and its point
     size : coefficients of a polynomial that doubles need
     slope1, middle3, middle4 : the derivative of theta1, and theta3 and theta4, at y = 0
+    rises : c of u - u1 = c theta1(y)^2/D(y)^2 at even N, or u - u2 at odd N
     odd_over_even : the square of the factor that theta1 and theta4 lack beside theta2 and theta3
     """
 
-    def __init__(self, roots: Roots) -> None:
+    def __init__(self, roots: Roots, root_f3: mpfr, *, falling: bool) -> None:
         self._roots = roots
         a, g, c = sqrt(roots.gap31), sqrt(roots.gap32), sqrt(roots.gap21)
         # w = root_f3 sqrt(u3 - u1)/2 and K = (pi/2) sqrt(u3 - u1)/M
         real_mean, imaginary_mean = agm(a, g), agm(a, c)
-        self.y_per_root_f3 = real_mean / 2
+        self.y_rate = root_f3 * real_mean / 2
         imaginary = g < c
         if imaginary:
             g, c = c, g
         self.stretch = imaginary_mean / real_mean if imaginary else ZERO
+        self.x_rate = self.y_rate * (self.stretch or ONE)
         q = exp(-const_pi() * (self.stretch or real_mean / imaginary_mean))
         self._a, self._c_squares = a, [c * c]
         while len(self._c_squares) == 1 or c > a * NEGLIGIBLE:
@@ -154,6 +157,18 @@ class ThetaForm:
         self.slope1, self.middle3, self.middle4 = (
             one.leading for one in (self.theta1, self.theta3, self.theta4))
         self.odd_over_even = 4 * sqrt(q) if imaginary else ONE
+        # chi is (2K/pi) y
+        rise = roots.gap21 * (self._a / (self._mean * self.slope1)) ** 2
+        self.rises = (rise * self.middle4 ** 2,
+                      -rise * self.middle3 ** 2 * roots.gap32 / roots.gap31)
+        # sn^2(chi) = low/gap21 and sn^2(K - chi) are equal at sn^2 (1 + sqrt(m1)) = 1.
+        low, high = -roots.y1, roots.y2
+        odd = low * sqrt(roots.gap32 / roots.gap31) >= high
+        sin = self.amplitude(odd, low, high, roots.y3)
+        y = asinh(sin) / self.stretch if imaginary else asin(sin)
+        self.start_whole = (-1 if falling else 1) if odd else 0
+        self.y0 = y if odd == falling else -y
+        self.start = point(self.y0, self.stretch)
 
     def amplitude(self, odd: bool, above1: mpfr, below2: mpfr, below3: mpfr) -> mpfr:
         """
@@ -181,12 +196,6 @@ class ThetaForm:
             h = (h + sqrt(h * h - c2 if square > 0 else h * h + c2)) / 2
         # The square may be 1 but for rounding: the sine is then 1.
         return min(self._mean / h, ONE) if square > 0 else self._mean / h
-
-    def rises_of_sn2(self) -> tuple[mpfr, mpfr]:
-        """Return c with sn^2 chi - sn^2(N K) = c theta1(y)^2/D(y)^2, at even and at odd N."""
-        size = (self._a / (self._mean * self.slope1)) ** 2      # chi is (2K/pi) y
-        return (size * self.middle4 ** 2,
-                -size * self.middle3 ** 2 * self._roots.gap32 / self._roots.gap31)
 
     def shifted(self, amplitude: mpfr, sense: int) -> tuple[Parts, Parts]:
         """
