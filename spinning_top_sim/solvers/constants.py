@@ -67,11 +67,6 @@ class Factor(NamedTuple):
     drift: mpfr = mp.ZERO           # kappa
     start_argument: mpfr = mp.ZERO  # of X exp(i kappa y) at t = 0 [rad]
 
-    @property
-    def passes_pole(self) -> bool:
-        """Whether X changes its sign."""
-        return any(real.prefactor == theta.SIN_ODD for real, _ in self.parts)
-
 
 class TurningPoint(NamedTuple):
     """The turning point at even N, where u = u1, or at odd N, where u = u2."""
@@ -108,7 +103,7 @@ class ThetaMotion(NamedTuple):
 
         def times_d(factor: Factor) -> mpc:
             real, imag = (part.at(point) for part in factor.parts[whole % 2])
-            if whole & 2 and factor.passes_pole:
+            if whole & 2 and any(one.prefactor == theta.SIN_ODD for one, _ in factor.parts):
                 real = -real
             sin, cos = sin_cos(factor.rate * t + factor.phase + factor.drift * y)
             return (real + 1j * imag) * (cos + 1j * sin)
@@ -276,11 +271,6 @@ def _quotient(form: ThetaForm, side: _Side, pole: theta.Place, is_beta: bool) ->
         flip = 1 if form.start_whole % 4 < 2 else -1
         if flip * (here[0].at(form.start) or here[0].leading * side.slope) < 0:
             scale = -scale
-    parts = (_scaled(at_even, scale),
-             _scaled(at_odd, scale * form.odd_over_even if is_beta else scale))
-    return Factor(side.pole_rate, rate, side.argument - argument, parts, drift, argument)
-
-
-def _scaled(parts: theta.Parts, factor: mpfr) -> theta.Parts:
-    real, imag = parts
-    return real.scaled(factor), imag.scaled(factor)
+    even, odd = ((real.scaled(x), imag.scaled(x)) for (real, imag), x in (
+        (at_even, scale), (at_odd, scale * form.odd_over_even if is_beta else scale)))
+    return Factor(side.pole_rate, rate, side.argument - argument, (even, odd), drift, argument)

@@ -129,7 +129,8 @@ class SteppedMotion(Motion):
         the first step's length comes
     """
 
-    derivative: Callable[..., Unknowns]   # f of the unknowns, which it takes one by one
+    derivative: Callable[..., Unknowns]     # f of the unknowns, which it takes one by one
+    columns: Callable[..., States]          # of this, times [s], and what `_unknowns` returns
 
     def __init__(self, top: Top, start: State, y: Unknowns, tolerance: float,
                  fastest_rate: float) -> None:
@@ -151,10 +152,6 @@ class SteppedMotion(Motion):
     @abstractmethod
     def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
-
-    @abstractmethod
-    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
-        """Return the states at times [s] from what `_unknowns` returns."""
 
     def _take_step(self) -> None:
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
@@ -233,7 +230,7 @@ class SteppedMotion(Motion):
                 self._forget(max(len(self._knots) - MOST_KEPT, 0))
                 self._take_steps(float(t[-1]))
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
-        return self._states_of(t.copy(), unknowns)
+        return self.columns(self, t.copy(), unknowns)
 
     def _take_steps(self, until: float) -> None:
         """Take STEPS_TOGETHER steps towards a time [s], or those that are missing."""
