@@ -33,12 +33,10 @@ def _closed_form(top: Top, start: State, *_: Any) -> Motion:
     return ExactSolution(top, start)
 
 
-def _steps(top: Top, start: State, equations: str, *others: Any) -> Motion:
-    return EQUATIONS[equations](top, start, *others)
-
-
 # They make a motion of the top, the start, the name of equations, and what these take.
-METHODS: Mapping[str, Callable[..., Motion]] = {'rk45': _steps, 'exact': _closed_form}
+METHODS: Mapping[str, Callable[..., Motion]] = {
+    'rk45': lambda top, start, equations, *others: EQUATIONS[equations](top, start, *others),
+    'exact': _closed_form}
 
 
 def motion_of(top: Top, start: State | Posture, *, method: str, equations: str = 'transport',

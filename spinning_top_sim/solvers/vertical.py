@@ -32,10 +32,6 @@ Complex = Any
 POLE_IN_BITS, POLE_IN_DOUBLES = 1e-30, 1.5e-8
 
 
-def _sin_cos(angle: float) -> tuple[float, float]:
-    return math.sin(angle), math.cos(angle)
-
-
 class Posture(NamedTuple):
     """
     Attitude and angular velocity at one instant, in any numbers.
@@ -55,7 +51,8 @@ class Posture(NamedTuple):
 
     @classmethod
     def of(cls, top: Top, state: State, real: Callable[[Any], Real] = float,
-           sin_cos: Callable[[Real], tuple[Real, Real]] = _sin_cos) -> Posture:
+           sin_cos: Callable[[Real], tuple[Real, Real]] = lambda x: (math.sin(x), math.cos(x)),
+           ) -> Posture:
         """Return that of a state, which may be continued, in numbers with this sine and cosine."""
         half, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
         (sine, cosine), *others = map(sin_cos, (half, phi + psi, phi - psi))
