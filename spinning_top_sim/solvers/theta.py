@@ -17,13 +17,7 @@ from operator import add, mul
 
 from gmpy2 import agm, asin, asinh, const_pi, exp, frexp, get_context, mpfr, sin_cos, sinh, sqrt
 
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    ONE,
-    ZERO,
-    DigitsLostError,
-    Roots,
-)
+from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, DigitsLostError, Roots
 
 # What the terms of a series have in common: one of the four prefactors 1, cos y, sin y and
 # sin y cos y.  The rest of cos(n y) or sin(n y) is a polynomial in xi = sin^2 y [DLMF 4.21(iii)],
@@ -136,6 +130,22 @@ class ThetaForm:
             c = self._c_squares[-1] / (4 * a)       # [DLMF 19.8.3]
             self._c_squares.append(c * c)
         self._mean = a
+        self._make_series(q)
+        # chi is (2K/pi) y
+        rise = roots.gap21 * (self._a / (self._mean * self.slope1)) ** 2
+        self.rises = (rise * self.middle4 ** 2,
+                      -rise * self.middle3 ** 2 * roots.gap32 / roots.gap31)
+        # sn^2(chi) = low/gap21 and sn^2(K - chi) are equal at sn^2 (1 + sqrt(m1)) = 1.
+        low, high = -roots.y1, roots.y2
+        odd = low * sqrt(roots.gap32 / roots.gap31) >= high
+        sin = self.amplitude(odd, low, high, roots.y3)
+        y = asinh(sin) / self.stretch if imaginary else asin(sin)
+        self.start_whole = (-1 if falling else 1) if odd else 0
+        self.y0 = y if odd == falling else -y
+        self.start = point(self.y0, self.stretch)
+
+    def _make_series(self, q: mpfr) -> None:
+        """Set the series by their nome."""
         exponent, significand = frexp(q)
         depth = -math.log10(significand) - exponent * math.log10(2.0)
         # Terms k are of size q^(k^2 - k/2) or less beside the first one.
@@ -153,22 +163,10 @@ class ThetaForm:
         self.theta1 = Series(SIN_ODD, _alternating(self._odd))
         self.theta3 = Series(COS_EVEN, self._even)
         pair = Series(COS_ODD, self._odd), Series(COS_EVEN, _alternating(self._even))
-        self.theta2, self.theta4 = pair[::-1] if imaginary else pair
+        self.theta2, self.theta4 = pair[::-1] if self.stretch else pair
         self.slope1, self.middle3, self.middle4 = (
             one.leading for one in (self.theta1, self.theta3, self.theta4))
-        self.odd_over_even = 4 * sqrt(q) if imaginary else ONE
-        # chi is (2K/pi) y
-        rise = roots.gap21 * (self._a / (self._mean * self.slope1)) ** 2
-        self.rises = (rise * self.middle4 ** 2,
-                      -rise * self.middle3 ** 2 * roots.gap32 / roots.gap31)
-        # sn^2(chi) = low/gap21 and sn^2(K - chi) are equal at sn^2 (1 + sqrt(m1)) = 1.
-        low, high = -roots.y1, roots.y2
-        odd = low * sqrt(roots.gap32 / roots.gap31) >= high
-        sin = self.amplitude(odd, low, high, roots.y3)
-        y = asinh(sin) / self.stretch if imaginary else asin(sin)
-        self.start_whole = (-1 if falling else 1) if odd else 0
-        self.y0 = y if odd == falling else -y
-        self.start = point(self.y0, self.stretch)
+        self.odd_over_even = 4 * sqrt(q) if self.stretch else ONE
 
     def amplitude(self, odd: bool, above1: mpfr, below2: mpfr, below3: mpfr) -> mpfr:
         """
@@ -188,7 +186,7 @@ class ThetaForm:
         if not square:
             return ZERO
         if 1 - square < LEAST_COSINE_SQUARE and get_context().precision == BITS:
-            raise DigitsLostError       # half of those of the cosine, for which twice as many do
+            raise DigitsLostError       # half of those of the cosine: twice as many do for it
         # By descending Gauss transformations [DLMF 19.8.18], which leave chi/K as it is and end at
         # m = 0.  In terms of h = a/sin or a/sinh of the amplitude a step is a mean too.
         h = self._a / sqrt(abs(square))
