@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The regular equations of motion, stepped by rk45, and their states."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -50,7 +48,7 @@ class _TransportStates(States):
 
     method = 'rk45'
 
-    def __init__(self, motion: TransportMotion, t: Column, rows: UnknownRows) -> None:
+    def __init__(self, motion: 'TransportMotion', t: Column, rows: UnknownRows) -> None:
         super().__init__(motion.top, motion.start, len(t))
         self.t, self._motion = t, motion
         self._stepped: Components = tuple(rows[:6])

@@ -78,8 +78,8 @@ class Posture(NamedTuple):
         Return sin(theta/2), cos(theta/2), theta', Lz and two numbers, about the same vertical.
 
         theta is in [0, pi], and the arguments of the complex numbers, which have any modulus, are
-        (phi + psi)/2 and (phi - psi)/2.  A vertical axis has no precession angle of its own: there the angle is that of the line
-        about which the axis turns, so that all of this motion is nutation.
+        (phi + psi)/2 and (phi - psi)/2.  A vertical axis has no precession angle of its own: there
+        it is that of the line about which the axis turns, so that all of this motion is nutation.
 
         pole : within which tilt an axis that is not that of a state is vertical [rad]
         """
