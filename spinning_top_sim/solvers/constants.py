@@ -38,7 +38,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sqrt
+from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -99,7 +99,9 @@ class ThetaMotion(NamedTuple):
         whole = int(rint(quarters))
         y = const_pi() / 2 * (
             (self.start_whole - whole) + self.quarter_rate * t + self.start_offset)
-        point, twice = (theta.point(angle, self.stretch) for angle in (y, 2 * y))
+        point, twice = (
+            theta.point(sinh(self.stretch * angle) if self.stretch else sin_cos(angle)[0],
+                        bool(self.stretch)) for angle in (y, 2 * y))
 
         def times_d(factor: Factor) -> mpc:
             real, imag = (part.at(point) for part in factor.parts[whole % 2])

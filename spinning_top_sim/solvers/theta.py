@@ -15,7 +15,7 @@ from functools import reduce
 from itertools import count, zip_longest
 from operator import add, mul
 
-from gmpy2 import agm, asin, asinh, const_pi, exp, frexp, get_context, mpfr, sin_cos, sinh, sqrt
+from gmpy2 import agm, asin, asinh, const_pi, exp, frexp, get_context, mpfr, sqrt
 
 from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, DigitsLostError, Roots
 
@@ -50,10 +50,9 @@ MULTIPLE_ANGLES = [_multiple_angles(*pair) for pair in FIRST_POLYNOMIALS]
 Point = tuple[mpfr, mpfr, mpfr]
 
 
-def point(y: mpfr, stretch: mpfr) -> Point:
-    """Return the point of y, |y| <= pi/2; `stretch` is that of a `ThetaForm`."""
-    sin = sinh(stretch * y) if stretch else sin_cos(y)[0]
-    xi = -sin * sin if stretch else sin * sin
+def point(sin: mpfr, imaginary: bool) -> Point:
+    """Return the point with this sin y, |y| <= pi/2, or sinh x."""
+    xi = -sin * sin if imaginary else sin * sin
     return sin, sqrt(1 - xi), xi
 
 
@@ -139,10 +138,11 @@ class ThetaForm:
         low, high = -roots.y1, roots.y2
         odd = low * sqrt(roots.gap32 / roots.gap31) >= high
         sin = self.amplitude(odd, low, high, roots.y3)
-        y = asinh(sin) / self.stretch if imaginary else asin(sin)
+        if odd != falling:
+            sin = -sin
+        self.start = point(sin, imaginary)
+        self.y0 = asinh(sin) / self.stretch if imaginary else asin(sin)
         self.start_whole = (-1 if falling else 1) if odd else 0
-        self.y0 = y if odd == falling else -y
-        self.start = point(self.y0, self.stretch)
 
     def _make_series(self, q: mpfr) -> None:
         """Set the series by their nome."""
