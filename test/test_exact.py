@@ -136,6 +136,12 @@ def test_angles_go_on_from_a_state_beyond_a_pole(method, state):
                 getattr(expected, name), abs=1e-13 if method == 'exact' else 1e-7), name
 
 
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_a_motion_too_fast_for_doubles_is_refused(method):
+    with pytest.raises(ValueError, match=r'rate of the axis must be at most 1e\+100 rad/s'):
+        solve(UNIT, start(3e-133, l3=1.6, lz=1.1), [0.0], method=method)
+
+
 def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():
     assert doctest.testmod(solve_module) == (0, 4)
     with pytest.raises(TypeError, match=r'^solve\(State, Top, ...\): must be solve\(top'):

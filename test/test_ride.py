@@ -22,7 +22,6 @@ from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
 from spinning_top_sim.physics.states import States, joined
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import precision
 from spinning_top_sim.solvers.vertical import Posture
@@ -139,15 +138,10 @@ def test_steps_beside_a_pole_begin_with_all_that_is_handed_over():
     assert abs(exact).max() < 5e-8 and abs(steps - exact).max() <= 1e-9 * abs(exact).max()
 
 
-def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
-    piece = Piece(TOP, State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5), 5 * S,
-                  equations='euler')
-    with pytest.raises(IntegrationError, match='pole') as error:
-        piece.states(np.arange(5 * S, 9 * S, S // 100))
-    reached_ns = error.value.reached_ns
-    assert piece.states(np.array([reached_ns])).theta[0] < 0.1
-    with pytest.raises(IntegrationError):
-        piece.states(np.array([reached_ns + S // 10]))
+def test_a_piece_goes_on_as_long_as_another_ride():
+    longer = ride((0.5, 0, 0))._replace(end_ns=9 * S)
+    piece = Piece(TOP, State(theta=0.5, l3=1.6, lz=1.3), 0, ride((0.5, 0, 0)))
+    assert piece.with_ride(longer).ride is longer
 
 
 def test_joined_states_have_the_columns_of_their_parts():
