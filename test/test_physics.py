@@ -58,7 +58,7 @@ def test_a_drift_is_relative_absolute_where_the_constant_is_0_and_finite(start, 
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_attitude_rates_energy_and_momenta_are_those_of_the_euler_angles(seed):
+def test_attitude_rates_and_energy_are_those_of_the_euler_angles(seed):
     """Of random states, by an independent library; the rates are those of the Lagrangian."""
     rng = np.random.default_rng(seed)
     start = State(theta=rng.uniform(0.01, math.pi - 0.01), **dict(zip(
@@ -74,10 +74,8 @@ def test_attitude_rates_energy_and_momenta_are_those_of_the_euler_angles(seed):
              + psi_dot * rotation.apply((0.0, 0.0, 1.0)))
     assert rotation.inv().apply(world) == pytest.approx(
         state.angular_velocity[0], abs=1e-14 * (1.0 + abs(phi_dot) + abs(psi_dot)))
-    # Eqs. (7), (11), (13), (14).
+    # Eqs. (13), (14).
     top, c, s = state.top, math.cos(start.theta), math.sin(start.theta)
-    assert top.lambda3 * (psi_dot + phi_dot * c) == pytest.approx(start.l3)
-    assert top.lambda1 * phi_dot * s * s + start.l3 * c == pytest.approx(start.lz)
     kinetic = (0.5 * top.lambda1 * (phi_dot ** 2 * s * s + start.theta_dot ** 2)
                + start.l3 ** 2 / (2.0 * top.lambda3))
     assert state.energy[0] == pytest.approx(kinetic + top.gravity_torque * c)
