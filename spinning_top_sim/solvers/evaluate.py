@@ -108,6 +108,7 @@ class ThetaArrays:
     sign, turn : theta is sign * (theta in [0, pi]) + turn, for a start beyond a pole
     on_line : 0 for alpha and 1 for beta: those that move on a line through zero, s = 0
     zeros : those that pass zero, and whether R = 0 at y = 0 is at even N (0) or at odd N (1)
+    fall : of theta' sin(theta) = fall theta1(2y)/D^4, with the sign of sin(theta)
     sense : in which theta/2 goes round if both poles are passed, else 0
     """
 
@@ -138,8 +139,9 @@ class ThetaArrays:
         self.sense = math.copysign(1.0, start.theta_dot) * self.sign * (len(self.zeros) == 2)
         self.start_half = 0.5 * abs(start.theta - self.turn)
         # At even and at odd N
-        _, self.precession, self.swing, self.u_dot = np.array(
+        _, self.precession, self.swing, u_dot = np.array(
             [[*map(float, one)] for one in motion.turning]).T
+        self.fall = -self.sign * u_dot
         self.theta1 = _highest_first([motion.theta1.polynomial(motion.size)])
 
 
@@ -197,7 +199,8 @@ class ExactStates(States):
         """|alpha| D and |beta| D, (2, n); signed, not absolute, where s = 0."""
         # The squares may be too small for a double.
         moduli: Matrix = np.hypot(self._real, self._imag)
-        moduli[self._arrays.on_line] = self._real[self._arrays.on_line]
+        for k in self._arrays.on_line:
+            moduli[k] = self._real[k]
         return moduli
 
     @cached_property
@@ -236,7 +239,7 @@ class ExactStates(States):
     def theta_dot(self) -> Column:
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
-        if not arrays.u_dot.any():      # it rests, perhaps at a pole
+        if not arrays.fall.any():       # it rests, perhaps at a pole
             return np.zeros(len(xi))
         size, without = alpha * alpha + beta * beta, [alpha, beta]
         prefactor = self._sin_y * self._cos_y
@@ -246,9 +249,9 @@ class ExactStates(States):
             without[k] = np.where(here, self._without_zero[k], without[k])
         series = prefactor * _horner(arrays.theta1, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        rate: Column = -arrays.u_dot.take(self._parity) * (series / size) / (
+        rate: Column = arrays.fall.take(self._parity) * (series / size) / (
             without[0] * without[1])
-        return arrays.sign * rate
+        return rate
 
     @cached_property
     def across(self) -> Column:

@@ -84,9 +84,11 @@ class Posture(NamedTuple):
         pole : within which tilt an axis that is not that of a state is vertical [rad]
         """
         alpha, beta, transverse, l3, theta_dot, lz = self
-        cosine2, sine2 = (alpha * alpha.conjugate()).real, (beta * beta.conjugate()).real
-        size2 = cosine2 + sine2
-        cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
+        cosine, sine, size2 = abs(alpha), abs(beta), 1
+        if lz is None:          # after turns the length is 1 but for rounding
+            cosine2, sine2 = (alpha * alpha.conjugate()).real, (beta * beta.conjugate()).real
+            size2 = cosine2 + sine2
+            cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
         l3 += 0 * sine          # in numbers of the same kind
         tilt = 2 * min(sine, cosine)
         if not tilt or (lz is None and tilt < pole):
