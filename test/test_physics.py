@@ -16,7 +16,6 @@ from spinning_top_sim.streams import parameters
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.80665}
 STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
-RATES = {'precession': 1.0, 'spin': 2.0}
 
 
 @pytest.mark.parametrize(('make', 'given', 'field', 'value'), [
@@ -29,8 +28,9 @@ RATES = {'precession': 1.0, 'spin': 2.0}
         ('lz', '1.0 kg'))),
     *((State, {**STATE, 'theta': theta}, 'lz', lz) for theta, lz in (
         (0.0, -1.6), (math.pi, 1.6))),      # at a pole only one is possible
-    *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), **RATES}, field, value)
-      for field, value in (('theta', -0.1), ('precession', math.nan), ('spin', '3 rad/s')))])
+    *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), 'precession': 1.0, 'spin': 2.0},
+       field, value) for field, value in (
+           ('theta', -0.1), ('precession', math.nan), ('spin', '3 rad/s')))])
 def test_a_bad_constant_state_or_rate_is_refused_by_name_and_value(make, given, field, value):
     with pytest.raises(ValueError, match=rf'{field} = .*must ') as error:
         make(**{**given, field: value})

@@ -2,8 +2,7 @@
 """
 Dormand-Prince steps: accuracy and cost, poles, refusals.
 
-The judge is the reference data (30 digits), and where that has no time the exact solution, which
-test_exact.py holds against the same data.
+The judge is the reference data (30 digits), and where that has no time the exact solution.
 """
 
 import math
