@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from helpers.examples import examples
 from helpers.extremes import DOUBLES
-from helpers.simulations import SECOND, play, simulate
 from helpers.tops import COLUMNS, UNIT, time_limit
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -17,8 +16,6 @@ from hypothesis import strategies as st
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.live import LiveSimulation
-from spinning_top_sim.times import LAST_STAMP_NS
 
 START = {'theta': 0.6, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.8}
@@ -96,14 +93,3 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': Tr
 def test_what_makes_no_sense_is_refused_in_words(values, words):
     with pytest.raises(ValueError, match=words):
         parameters.checked(values)
-
-
-def test_a_run_offline_whose_stamps_would_end_is_refused_before():
-    simulation = simulate()
-    simulation.apply('epoch', epoch_ns=LAST_STAMP_NS - SECOND + 1)
-    with pytest.raises(IntegrationError, match='2038'):
-        play(simulation, 2 * SECOND)
-    assert simulation.sent_ns == SECOND - 1
-    for epoch_ns in (LAST_STAMP_NS - 5, -1, 2 ** 70):
-        with pytest.raises(ValueError, match='must be >= 0 and < 2147483648 s'):
-            LiveSimulation(parameters.checked({'duration': 1.0}), epoch_ns)

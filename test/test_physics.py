@@ -16,7 +16,6 @@ from spinning_top_sim.streams import parameters
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.80665}
 STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
-RATES = {'precession': 1.0, 'spin': 2.0}
 
 
 @pytest.mark.parametrize(('make', 'given', 'field', 'value'), [
@@ -29,8 +28,9 @@ RATES = {'precession': 1.0, 'spin': 2.0}
         ('lz', '1.0 kg'))),
     *((State, {**STATE, 'theta': theta}, 'lz', lz) for theta, lz in (
         (0.0, -1.6), (math.pi, 1.6))),      # at a pole only one is possible
-    *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), **RATES}, field, value)
-      for field, value in (('theta', -0.1), ('precession', math.nan), ('spin', '3 rad/s')))])
+    *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), 'precession': 1.0, 'spin': 2.0},
+       field, value) for field, value in (
+           ('theta', -0.1), ('precession', math.nan), ('spin', '3 rad/s')))])
 def test_a_bad_constant_state_or_rate_is_refused_by_name_and_value(make, given, field, value):
     with pytest.raises(ValueError, match=rf'{field} = .*must ') as error:
         make(**{**given, field: value})
@@ -57,14 +57,8 @@ def test_a_drift_is_relative_absolute_where_the_constant_is_0_and_finite(start, 
     assert tuple(relative_drift(np.array([-1.0, -2.0, -3.0]), start)) == expected
 
 
-def test_realizable_is_the_triangle_inequality_about_the_centre_of_mass():
-    across = 2.0 * 0.15 ** 2
-    assert Top(**{**TOP, 'lambda1': 0.075 + across}).is_realizable
-    assert not Top(**{**TOP, 'lambda1': 0.0749 + across}).is_realizable
-
-
 @pytest.mark.parametrize('seed', range(20))
-def test_attitude_rates_energy_and_momenta_are_those_of_the_euler_angles(seed):
+def test_attitude_rates_and_energy_are_those_of_the_euler_angles(seed):
     """Of random states, by an independent library; the rates are those of the Lagrangian."""
     rng = np.random.default_rng(seed)
     start = State(theta=rng.uniform(0.01, math.pi - 0.01), **dict(zip(
@@ -80,10 +74,8 @@ def test_attitude_rates_energy_and_momenta_are_those_of_the_euler_angles(seed):
              + psi_dot * rotation.apply((0.0, 0.0, 1.0)))
     assert rotation.inv().apply(world) == pytest.approx(
         state.angular_velocity[0], abs=1e-14 * (1.0 + abs(phi_dot) + abs(psi_dot)))
-    # Eqs. (7), (11), (13), (14).
+    # Eqs. (13), (14).
     top, c, s = state.top, math.cos(start.theta), math.sin(start.theta)
-    assert top.lambda3 * (psi_dot + phi_dot * c) == pytest.approx(start.l3)
-    assert top.lambda1 * phi_dot * s * s + start.l3 * c == pytest.approx(start.lz)
     kinetic = (0.5 * top.lambda1 * (phi_dot ** 2 * s * s + start.theta_dot ** 2)
                + start.l3 ** 2 / (2.0 * top.lambda3))
     assert state.energy[0] == pytest.approx(kinetic + top.gravity_torque * c)

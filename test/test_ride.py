@@ -76,7 +76,7 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     # In the longest one an error grows by some 1e10: the true motion is chaotic.
     assert worst_error(run, case) <= EXACT
     end, found = case['times_ns'][-1], []
-    alpha, beta, transverse, l3 = run.after(end).posture(end)
+    alpha, beta, transverse, l3, *_ = run.after(end).posture(end)
     with precision():
         last = {key: [*map(mpfr, values)] for key, values in case['states'][-1].items()}
         parts = (alpha.real, -beta.imag, beta.real, alpha.imag, transverse.real,
@@ -139,21 +139,17 @@ def test_steps_beside_a_pole_begin_with_all_that_is_handed_over():
     assert abs(exact).max() < 5e-8 and abs(steps - exact).max() <= 1e-9 * abs(exact).max()
 
 
-def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
-    piece = Piece(TOP, State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5), 5 * S,
-                  equations='euler')
+def test_an_error_says_up_to_when_states_can_be_had():
+    piece = Piece(TOP, State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5), 5 * S, equations='euler')
     with pytest.raises(IntegrationError, match='pole') as error:
-        piece.states(np.arange(5 * S, 9 * S, S // 100))
-    reached_ns = error.value.reached_ns
-    assert piece.states(np.array([reached_ns])).theta[0] < 0.1
-    with pytest.raises(IntegrationError):
-        piece.states(np.array([reached_ns + S // 10]))
+        piece.states(np.array([9 * S]))
+    assert piece.states(np.array([error.value.reached_ns])).theta[0] < 0.1
 
 
-def test_the_exact_twin_of_a_piece_has_its_ride():
-    piece, longer = (Piece(TOP, State(theta=0.5, l3=1.6, lz=1.3), 0, ride((0.5, 0, 0))),
-                     ride((0.5, 0, 0))._replace(end_ns=9 * S))
-    assert piece.exact.ride is piece.ride and piece.with_ride(longer).exact.ride is longer
+def test_a_piece_goes_on_as_long_as_another_ride():
+    longer = ride((0.5, 0, 0))._replace(end_ns=9 * S)
+    piece = Piece(TOP, State(theta=0.5, l3=1.6, lz=1.3), 0, ride((0.5, 0, 0)))
+    assert piece.with_ride(longer).ride is longer
 
 
 def test_joined_states_have_the_columns_of_their_parts():
@@ -177,22 +173,12 @@ def test_joined_states_have_the_columns_of_their_parts():
             [rows(part, name) for part in parts], axis=-1)), name
 
 
-def test_the_velocity_of_a_point_is_that_of_its_position():
-    start, point = State(theta=0.5, theta_dot=0.3, l3=1.6, lz=1.3), (0.1, -0.2, 0.3)
-    near = Piece(TOP, start, 0, ride((1.0, 2.0, 0.5)), method='exact').states(
-        np.arange(S // 2 - 100_000, S // 2 + 100_001, 100_000))
-    moved = np.diff(np.array(near.position(point))[:, ::2], axis=1)[:, 0] / 2e-4
-    velocity = np.array(attitude.rotated(near.rows_quaternion, near.world_velocity(point)))[:, 1]
-    assert moved == pytest.approx(velocity, abs=1e-6)
-
-
 # The path of the pivot
 
-SQUARE = [(0.0, 0.0, 0.5), (1.1, 0.0, 0.5), (1.1, 1.1, 0.5), (0.0, 1.1, 0.5)]
 TRIANGLE = [(0.1, 0.2, 0.3), (1.7, 0.3, -0.4), (0.6, 2.1, 0.9)]
 
 
-@pytest.mark.parametrize('waypoints', [SQUARE, TRIANGLE, TRIANGLE[:2]])
+@pytest.mark.parametrize('waypoints', [TRIANGLE, TRIANGLE[:2]])
 def test_a_repeated_path_closes(waypoints):
     path = PivotPath.through(waypoints, speed=0.7, acceleration=1.3, repeat=True)
     now, ends = path.ride(0), []

@@ -4,7 +4,7 @@ The heavy symmetric top in theta functions: what is computed once for a motion, 
 
 The solution is Klein's: F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI;
 E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72.  docs/theta_functions.md derives
-it, with r+- for r - s pi w/(2K).  DLMF: https://dlmf.nist.gov, ch. 19, 20 and 22.
+it, with r+- for r - s pi w/(2K).
 
 The last four lines of the symbols are of alpha; beta has its own.
 
@@ -34,18 +34,23 @@ there are 57 digits, and more if two roots are close; some 40 are left.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
+from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers import multiprecision as mp
-from spinning_top_sim.solvers.vertical import PreciseState
+from spinning_top_sim.solvers import theta
+from spinning_top_sim.solvers.theta import ThetaForm
+from spinning_top_sim.solvers.vertical import Posture
 
 BITS_TO_TRY = mp.BITS, 2 * mp.BITS, 4 * mp.BITS, 8 * mp.BITS
+# Smaller amplitudes leave no room for their squares in doubles.
+LEAST_AMPLITUDE = 1e-145
 with mp.precision():
     NO_GRAVITY = mpfr('1e-1000')    # so small that u3 is infinite to all bits
 
@@ -53,42 +58,74 @@ with mp.precision():
 class Factor(NamedTuple):
     """Alpha or beta, (R + i s J)/D exp i(r t + c + kappa y)."""
 
-    rate: mpfr                      # r [rad/s]
-    phase_turns: mpfr               # c [turns]
-    drift: mpfr                     # kappa
-    # R and s J at even and at odd N, less common factors.  If X changes its sign at a pole, R is a
-    # sine series at one of them, and has the factor (-1)^floor(N/2).
-    parts: tuple[mp.Parts, mp.Parts]
-    scales: tuple[mpfr, mpfr]       # these factors
     pole_rate: mpfr                 # (Lz +- L3)/(2 lambda1) [rad/s]; its sign is s
-    start_argument: mpfr            # of X exp(i kappa y) at t = 0 [rad]
+    rate: mpfr                      # r [rad/s]
+    phase: mpfr                     # c [rad]
+    # R and s J at even and at odd N.  If X changes its sign at a pole, R is a sine series at one
+    # of them, and lacks the factor (-1)^floor(N/2).
+    parts: tuple[theta.Parts, theta.Parts]
+    drift: mpfr = mp.ZERO           # kappa
+    start_argument: mpfr = mp.ZERO  # of X exp(i kappa y) at t = 0 [rad]
+
+
+class TurningPoint(NamedTuple):
+    """The turning point at even N, where u = u1, or at odd N, where u = u2."""
+
+    tilt: float                     # theta in [0, pi] [rad]
+    # Nearby, (Lz - L3 u)/lambda1 is precession + swing theta1(y)^2/D^2, and u' is
+    # u_dot theta1(2y)/D^4 [rad/s]
+    precession: mpfr
+    swing: mpfr = mp.ZERO
+    u_dot: mpfr = mp.ZERO
 
 
 class ThetaMotion(NamedTuple):
-    """A motion in theta functions.  Pairs are at even and at odd N."""
+    """A motion in theta functions; one with constant theta has the defaults."""
 
     alpha: Factor
     beta: Factor
-    stretch: mpfr | None = None     # K/K' if the series are in the imaginary form, of stretch y
+    turning: tuple[TurningPoint, TurningPoint]
+    theta1: theta.Series = theta.NOTHING
+    stretch: mpfr = mp.ZERO         # K/K' if the series are in the imaginary form, else 0
     quarter_rate: mpfr = mp.ZERO    # quarter periods per second, w/K
     start_whole: int = 0            # N at t = 0
-    start_offset: mpfr = mp.ZERO       # 2y/pi at t = 0, accurate relative to itself
-    u_dot: tuple[mpfr, mpfr] = (mp.ZERO, mp.ZERO)   # c of u' = c theta1(2y)/D^4
-    u_dot_series: mp.Series = mp.NOTHING           # theta1
-    # p and q of (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
-    precession: tuple[mpfr, mpfr] = (mp.ZERO, mp.ZERO)
-    swing: tuple[mpfr, mpfr] = (mp.ZERO, mp.ZERO)
+    start_offset: mpfr = mp.ZERO    # 2y/pi at t = 0, accurate relative to itself
     m1: mpfr = mp.ONE
-    size: int = mp.MOST_TERMS          # coefficients of each polynomial that doubles need
+    size: int = theta.MOST_TERMS    # coefficients of each polynomial that doubles need
+
+    def at(self, t: mpfr) -> tuple[mpc, mpc, mpc]:
+        """Return alpha, beta and omega_1 + i omega_2 at t [s], in multiprecision."""
+        quarters = self.start_whole + self.start_offset + self.quarter_rate * t
+        whole = int(rint(quarters))
+        y = const_pi() / 2 * (
+            (self.start_whole - whole) + self.quarter_rate * t + self.start_offset)
+        point, twice = (
+            theta.point(sinh(self.stretch * angle) if self.stretch else sin_cos(angle)[0],
+                        bool(self.stretch)) for angle in (y, 2 * y))
+
+        def times_d(factor: Factor) -> mpc:
+            real, imag = (part.at(point) for part in factor.parts[whole % 2])
+            if whole & 2 and any(one.prefactor == theta.SIN_ODD for one, _ in factor.parts):
+                real = -real
+            sin, cos = sin_cos(factor.rate * t + factor.phase + factor.drift * y)
+            return (real + 1j * imag) * (cos + 1j * sin)
+
+        alpha, beta = times_d(self.alpha), times_d(self.beta)
+        alpha2, beta2 = abs(alpha) ** 2, abs(beta) ** 2
+        d2, product = alpha2 + beta2, alpha * beta.conjugate()
+        # -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); 0 where the axis rests at a pole
+        u_dot = self.turning[whole % 2].u_dot * self.theta1.at(twice) / d2
+        momentum = self.alpha.pole_rate * beta2 + self.beta.pole_rate * alpha2
+        transverse = -(momentum + 0.5j * u_dot) / product if abs(product) else mpc(0)
+        return alpha / sqrt(d2), beta / sqrt(d2), transverse
 
 
-def precise(start: State | PreciseState) -> PreciseState:
-    """Return a state in multiprecision."""
-    return (start if isinstance(start, PreciseState)
-            else PreciseState.of(start, mpfr, sin_cos))
+def precise(top: Top, start: State | Posture) -> Posture:
+    """Return attitude and angular velocity in multiprecision."""
+    return start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)
 
 
-def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -> ThetaMotion:
+def set_up(top: Top, start: State | Posture, gravity: mpfr | None = None) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
@@ -96,183 +133,146 @@ def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -
 
     Raises ValueError if none of BITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
-    algebraic, and no double but 0 has an algebraic cosine.
+    algebraic, and no double but 0 has an algebraic cosine.  And if doubles cannot hold one.
     """
     for tried in BITS_TO_TRY:
         with mp.precision(tried):
             try:
                 return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
-            except mp.RootsTooCloseError:
+            except mp.DigitsLostError:
                 continue
     raise ValueError(f'{top} from {start}: closer to the separatrix or to steady precession than '
                      f'{BITS_TO_TRY[-1]} bits can tell')
 
 
 class _Side(NamedTuple):
-    """Alpha or beta at the start; momentum is Lz + L3 or Lz - L3, and x 1 + u or 1 - u."""
+    """
+    Alpha or beta at the start.
 
-    momentum: mpfr          # its argument has the rate (spin + momentum/(lambda1 x))/2
-    spin: mpfr
+    It is 0 where the axis passes its pole: x = 1 + u of alpha, x = 1 - u of beta.
+    """
+
+    pole_rate: mpfr         # (Lz + L3)/(2 lambda1) or (Lz - L3)/(2 lambda1) [rad/s]
+    half_spin: mpfr         # +- L3 (1/lambda3 - 1/lambda1)/2 [rad/s]
     argument: mpfr          # [rad]
     modulus: mpfr
     slope: mpfr             # twice the derivative of the modulus
-    # The pole where it vanishes: whether it is the one at u = 1, x at u1 and at u2, and, with
-    # c = (2K/pi) a or (2K/pi) b, sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one
-    # [DLMF 22.6(iv)], or None if there is no zero
-    is_beta: bool = False
-    x1: mpfr = mp.ZERO
-    x2: mpfr = mp.ZERO
-    zero: mpfr | None = None
+
+    def rate(self, x: mpfr) -> mpfr:
+        """Return that of the argument [rad/s]."""
+        return self.half_spin + self.pole_rate / x if self.pole_rate else self.half_spin
 
 
-def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
+def _set_up(top: Top, gravity: mpfr, start: State | Posture) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
-    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = precise(start)
-    spin = l3 * (1 / lambda3 - 1 / lambda1)
+    posture = precise(top, start)
+    sin_half, cos_half, theta_dot, lz, alpha, beta = posture.polar(top)
+    l3 = mpfr(posture.l3)
+    half_spin = l3 * (1 / lambda3 - 1 / lambda1) / 2
     arguments = [mp.atan2(z.imag, z.real) for z in (alpha, beta)]
-    sides = (_Side(lz + l3, spin, arguments[0], cos_half, -sin_half * theta_dot),
-             _Side(lz - l3, -spin, arguments[1], sin_half, cos_half * theta_dot))
+    sides = (
+        _Side((lz + l3) / (2 * lambda1), half_spin, arguments[0], cos_half, -sin_half * theta_dot),
+        _Side((lz - l3) / (2 * lambda1), -half_spin, arguments[1], sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
-        return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
+        return _resting(*sides)
     # theta -> pi - theta leaves M g R >= 0, and exchanges alpha and beta.
     mirror = -1 if torque < 0 else 1
-    return _nutating(
-        sides[::mirror], lambda1, mirror, l3, lz - l3 + 2 * l3 * sin_half ** 2,
-        (f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)), falling=mirror * theta_dot > 0)
+    return _nutating(sides, (f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)), mirror,
+                     falling=mirror * theta_dot > 0)
 
 
-def _resting(side: _Side, lambda1: mpfr) -> Factor:
-    """Return alpha = cos(theta/2) exp i(r t + c), or beta likewise, with constant theta."""
-    rate = side.spin / 2
-    if side.momentum:
-        rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
-    parts = mp.Series(mp.COS_EVEN, (mp.ONE,)), mp.NOTHING
-    return Factor(rate, side.argument / (2 * const_pi()), mp.ZERO, (parts, parts),
-                  (side.modulus, side.modulus), side.momentum / (2 * lambda1), mp.ZERO)
+def _resting(*sides: _Side) -> ThetaMotion:
+    """Return the motion with constant theta: alpha = cos(theta/2) exp i(r t + c)."""
+    x = [2 * side.modulus ** 2 for side in sides]
+    alpha, beta = (
+        Factor(side.pole_rate, side.rate(one), side.argument, (parts, parts))
+        for side, one in zip(sides, x, strict=True)
+        for parts in [(theta.Series(theta.COS_EVEN, [side.modulus]), theta.NOTHING)])
+    turning = _turning_point(sides, x)
+    return ThetaMotion(alpha, beta, (turning, turning))
 
 
-def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
-              precession_momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
-              ) -> ThetaMotion:
-    """
-    Return a motion with M g R >= 0, or with mirror = -1 that of which this is the mirror image.
+def _turning_point(sides: Sequence[_Side], x: Sequence[mpfr], swing: mpfr = mp.ZERO,
+                   u_dot: mpfr = mp.ZERO) -> TurningPoint:
+    """Return the turning point with this 1 + u and 1 - u."""
+    (alpha, beta), (plus, minus) = sides, x
+    return TurningPoint(2.0 * math.atan2(sqrt(minus), sqrt(plus)),
+                        alpha.pole_rate * minus + beta.pole_rate * plus, swing, u_dot)
 
-    precession_momentum : Lz - L3 u at the start of the motion itself
-    """
-    roots, f3 = mp.cubic_roots(*cubic), cubic[3]
-    imaginary = roots.gap21 > roots.gap32
-    a, g, c = sqrt(roots.gap31), sqrt(roots.gap32), sqrt(roots.gap21)
-    mean = mp.GaussMean(a, g, c)
-    form = mp.ThetaForm(mp.GaussMean(a, c, g) if imaginary else mean, imaginary)
-    start_whole, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
-    stretch = form.mean.mean / mean.mean if imaginary else None
-    sin = form.mean.amplitude(square, 1 if imaginary else -1)
-    xi = -sin * sin if imaginary else sin * sin
-    cos = sqrt(1 - xi)
-    y0 = direction * (asinh(sin) / stretch if stretch else mp.atan2(sin, cos))
-    root_f3 = sqrt(f3)
-    # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
-    y_rate = root_f3 * mean.mean / 2
-    factors = [_quotient(form, side, lambda1, y_rate * (stretch or 1), y_rate, start_whole, y0,
-                         (direction * sin, cos, xi))
-               for side in _with_poles(sides, roots, lambda1 ** 2 * f3, imaginary)]
-    swing_rate = root_f3 * (mirror * a / 2 * roots.gap21)       # w (u2 - u1)
-    even, odd = form.slopes_of_sn2()
-    turn = mirror * l3 / lambda1
-    swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
-    alpha, beta = factors[::mirror]
+
+def _nutating(sides: Sequence[_Side], cubic: tuple[mpfr, mpfr, mpfr, mpfr], mirror: int, *,
+              falling: bool) -> ThetaMotion:
+    """Return a motion; the cubic is its own, with M g R >= 0, or that of its mirror image (-1)."""
+    roots, f3, pair = mp.cubic_roots(*cubic), cubic[3], sides[::mirror]
+    form = ThetaForm(roots, sqrt(f3), falling=falling)
+    poles = _poles(pair, roots, f3)
+    alpha, beta = [_quotient(form, side, pole, is_beta) for side, pole, is_beta in zip(
+        pair, poles, (False, True), strict=True)][::mirror]
+    turn = pair[1].pole_rate - pair[0].pole_rate        # -L3/lambda1
+    even, odd = (
+        _turning_point(sides, [abs(pole[k]) for pole in poles][::mirror], turn * rise,
+                       rise * middle ** 2 * form.slope1 * mirror * form.x_rate)
+        for k, middle, rise in zip((0, 1), (form.middle4, form.middle3), form.rises, strict=True))
     return ThetaMotion(
-        alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(),
-        start_whole=start_whole, start_offset=y0 * 2 / const_pi(),
-        u_dot=(swing_rate * even, swing_rate * odd), u_dot_series=form.theta1,
-        precession=(precession_momentum / lambda1 - turn * roots.y1,
-                    precession_momentum / lambda1 - turn * roots.y2),
-        swing=(-swing * form.middle4 ** 2,
-               swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
-        m1=roots.gap32 / roots.gap31, size=form.size)
+        alpha, beta, (even, odd), form.theta1, form.stretch, 2 * form.y_rate / const_pi(),
+        form.start_whole, 2 * form.y0 / const_pi(), roots.gap32 / roots.gap31, form.size)
 
 
-def _with_poles(sides: Sequence[_Side], roots: mp.Roots, two_p_lambda1: mpfr,
-                imaginary: bool) -> tuple[_Side, _Side]:
+def _poles(pair: Sequence[_Side], roots: mp.Roots, f3: mpfr) -> tuple[theta.Place, theta.Place]:
     """
-    Return alpha and beta with their poles.
+    Return the places of the pole of either number, at u = -1 and u = 1.
 
     Nothing cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2.  So the product of
     three distances is known, and the smallest of them needs no difference.
     """
-    alpha, beta = sides
+    alpha, beta = pair
     c0, s0 = 2 * alpha.modulus ** 2, 2 * beta.modulus ** 2          # 1 + u0 and 1 - u0
-    below1, above2 = s0 - roots.y1, c0 + roots.y2
-    above1 = alpha.momentum ** 2 / (two_p_lambda1 * above2 * (roots.y3 + c0))
+    below1, above2, above3 = s0 - roots.y1, c0 + roots.y2, c0 + roots.y3
+    above1 = 4 * alpha.pole_rate ** 2 / (f3 * above2 * above3)
     below2, u3_minus_one = s0 - roots.y2, roots.y3 - s0
-    product = beta.momentum ** 2 / (two_p_lambda1 * below1)
+    product = 4 * beta.pole_rate ** 2 / (f3 * below1)
     if below2 <= u3_minus_one:
         below2 = product / u3_minus_one
     else:
         u3_minus_one = product / below2
-    scale = below1 * roots.gap32 if imaginary else u3_minus_one * roots.gap21
-    zero = below2 * roots.gap31 / scale if u3_minus_one else None
-    return (alpha._replace(x1=above1, x2=above2,
-                           zero=above1 / (above2 if imaginary else roots.gap21)),
-            beta._replace(is_beta=True, x1=below1, x2=below2, zero=zero))
+    return (-above1, above2, above3), (below1, -below2, u3_minus_one)
 
 
-def _nearest_quarter(roots: mp.Roots, complement: mpfr, falling: bool,
-                     imaginary: bool) -> tuple[int, int, mpfr]:
-    """
-    Return N at t = 0, the sign of y, and sn^2 or sn^2/cn^2 of the distance of chi from N K.
-
-    The latter, in the imaginary form, is -sn^2 of the distance times i, of the parameter m1
-    [DLMF 22.6(iv)].  complement : sqrt(m1)
-    """
-    sign = -1 if falling else 1
-    low, high = -roots.y1, roots.y2         # u0 - u1 and u2 - u0
-    # sn^2 = low/gap21, and sn(K - chi) = cn/dn.  They are equal at sn^2 (1 + sqrt(m1)) = 1.
-    if low * complement < high:
-        return 0, sign, low / (high if imaginary else roots.gap21)
-    return (sign, -sign, high * roots.gap31 / (
-        low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
-
-
-def _quotient(form: mp.ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate: mpfr,
-              quarters: int, y: mpfr, point: tuple[mpfr, mpfr, mpfr]) -> Factor:
-    """
-    Return alpha or beta as a quotient of theta functions.
-
-    x_rate, y_rate : of x and y, the arguments of the imaginary and of the real form [rad/s]
-    quarters, y, point : N, y and the arguments of `Series.at` at t = 0
-    """
-    sense, drift, rate = sign_of(side.momentum), mp.ZERO, side.spin / 2
-    farthest, real, imag = max(side.x1, side.x2), mp.ONE, mp.ZERO
-    scale = sqrt(farthest / 2)
-    starts_in_first = quarters % 2 == side.is_beta       # where X is theta1
-    if side.zero is None:           # proportional to dn
-        first, second = (form.theta4, mp.NOTHING), (form.theta3, mp.NOTHING)
-    elif not sense:
-        sign = -1 if side.is_beta else 1
-        first = mp.Series(mp.SIN_ODD, [sign * x for x in form.theta1.weights]), mp.NOTHING
-        second = form.theta2, mp.NOTHING
-        # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
-        # vanish they leave 0 with the slope.
-        series, _ = first if starts_in_first else second
-        flip = 1 if quarters % 4 < 2 else -1
-        if flip * (series.at(*point) or series.leading * side.slope) < 0:
-            scale = -scale
-    else:
-        amplitude = form.mean.amplitude(side.zero, -1 if form.imaginary else 1)
+def _quotient(form: ThetaForm, side: _Side, pole: theta.Place, is_beta: bool) -> Factor:
+    """Return alpha or beta as a quotient of theta functions."""
+    sense, drift, to_pole = sign_of(side.pole_rate), mp.ZERO, max(abs(pole[0]), abs(pole[1]))
+    rate, scale = side.half_spin, sqrt(to_pole / 2)
+    if 0 < scale < LEAST_AMPLITUDE:
+        raise ValueError(f'the amplitude of the motion is {float(scale):.3e}: the start is too '
+                         f'close to rest at a pole; must be 0 or at least {LEAST_AMPLITUDE}')
+    if sense:
+        amplitude = form.amplitude(is_beta, *pole)
         first, second = form.shifted(amplitude, sense)
         drift = -sense * mp.ONE
-        if form.imaginary:
+        if form.stretch:
             drift += sense * 2 / const_pi() * mp.atan2(amplitude, sqrt(1 - amplitude * amplitude))
-        rate += (side.momentum / (2 * lambda1 * farthest) - drift * y_rate
-                 - second[1].leading / second[0].leading * x_rate)
-        real, imag = (part.at(*point) for part in (first if starts_in_first else second))
+        rate = (side.rate(to_pole) - drift * form.y_rate
+                - second[1].leading / second[0].leading * form.x_rate)
+    elif pole[2]:
+        first = form.theta1.scaled(-mp.ONE if is_beta else mp.ONE), theta.NOTHING
+        second = form.theta2, theta.NOTHING
+    else:                       # proportional to dn
+        first, second = (form.theta4, theta.NOTHING), (form.theta3, theta.NOTHING)
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
-    scale *= (form.middle4 if side.is_beta else form.middle3) / second[0].leading
-    parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if side.is_beta
-                     else ((first, second), (scale, scale)))
-    start_argument = drift * y + mp.atan2(imag, real)
-    return Factor(rate, (side.argument - start_argument) / (2 * const_pi()), drift, parts, scales,
-                  side.momentum / (2 * lambda1), start_argument)
+    scale *= (form.middle4 if is_beta else form.middle3) / second[0].leading
+    at_even, at_odd = (second, first) if is_beta else (first, second)
+    here, argument = (at_odd if form.start_whole % 2 else at_even), drift * form.y0
+    if sense:
+        real, imag = (part.at(form.start) for part in here)
+        argument += mp.atan2(imag, real)
+    elif pole[2]:
+        # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
+        # vanish they leave 0 with the slope.
+        flip = 1 if form.start_whole % 4 < 2 else -1
+        if flip * (here[0].at(form.start) or here[0].leading * side.slope) < 0:
+            scale = -scale
+    even, odd = ((real.scaled(x), imag.scaled(x)) for (real, imag), x in (
+        (at_even, scale), (at_odd, scale * form.odd_over_even if is_beta else scale)))
+    return Factor(side.pole_rate, rate, side.argument - argument, (even, odd), drift, argument)

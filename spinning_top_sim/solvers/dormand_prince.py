@@ -104,15 +104,12 @@ def unrolled_step(size: int, is_complex: bool) -> StepFunction:
     return scope['step']
 
 
-class Step(NamedTuple):
-    """One accepted step: times [s], unknowns and their derivatives at both ends."""
+class Knot(NamedTuple):
+    """Where a step ends and the next begins: time [s], unknowns and their derivatives."""
 
-    t0: float
-    y0: Unknowns
-    derivative0: Unknowns
-    t1: float
-    y1: Unknowns
-    derivative1: Unknowns
+    t: float
+    y: Unknowns
+    derivative: Unknowns
 
 
 def components(vectors: Sequence[float] | Sequence[Unknowns]) -> UnknownRows:
@@ -132,14 +129,14 @@ class SteppedMotion(Motion):
         the first step's length comes
     """
 
-    derivative: Callable[..., Unknowns]   # f of the unknowns, which it takes one by one
+    derivative: Callable[..., Unknowns]     # f of the unknowns, which it takes one by one
+    columns: Callable[..., States]          # of this, times [s], and what `_unknowns` returns
 
     def __init__(self, top: Top, start: State, y: Unknowns, tolerance: float,
                  fastest_rate: float) -> None:
         super().__init__(top, start)
-        derivative = self.derivative(*y)
-        # The steps that can still be read, in order; the first one has no length.
-        self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
+        # Between these the motion can still be read; the first step has no length.
+        self._knots = 2 * [Knot(0.0, y, self.derivative(*y))]
         # A careful first step: the control finds the right one within a few.
         self._next_step = 0.1 * math.pow(tolerance, 0.2) / max(fastest_rate, 1e-100)
         self.steps, self.evaluations = 0, 1
@@ -156,14 +153,9 @@ class SteppedMotion(Motion):
     def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
 
-    @abstractmethod
-    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
-        """Return the states at times [s] from what `_unknowns` returns."""
-
     def _take_step(self) -> None:
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
-        newest = self._kept[-1]
-        t, y, derivative = newest.t1, newest.y1, newest.derivative1
+        t, y, derivative = self._knots[-1]
         grow, step = GROW, unrolled_step(len(y), isinstance(y[0], complex))
         while True:
             end = t + self._next_step
@@ -186,11 +178,11 @@ class SteppedMotion(Motion):
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.
-        self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
+        self._knots.append(Knot(end, y_new, derivative_new))
 
     @property
     def reached_ns(self) -> int:
-        end = self._kept[-1].t1
+        end = self._knots[-1].t
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
 
@@ -198,11 +190,11 @@ class SteppedMotion(Motion):
         self._forget(self._number(before_ns / NANOSECONDS))
 
     def _forget(self, count: int) -> None:
-        del self._kept[:count]
+        del self._knots[:count]
 
     def _number(self, t: float) -> int:
-        """Return which of the steps that are kept a time [s] lies in, or comes after."""
-        return bisect_left(self._kept, t, hi=len(self._kept) - 1, key=attrgetter('t1'))
+        """Return which of the knots the step begins at that a time [s] lies in, or comes after."""
+        return bisect_left(self._knots, t, 1, len(self._knots) - 1, key=attrgetter('t')) - 1
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """
@@ -212,7 +204,7 @@ class SteppedMotion(Motion):
         than MOST_KEPT steps away; up to its `reached_ns`, the states can be had then.
         """
         t, most = ns_array(times_ns) / NANOSECONDS, self.steps + MOST_KEPT
-        while len(t) and self._kept[-1].t1 < t[-1]:
+        while len(t) and self._knots[-1].t < t[-1]:
             if self.steps >= most:
                 raise IntegrationError(f't = {float(t[-1])!r} s is more than {MOST_KEPT} steps '
                                        'away: ask for times between', reached_ns=self.reached_ns)
@@ -225,29 +217,29 @@ class SteppedMotion(Motion):
 
         Raises IntegrationError for a time before the steps that are kept, or out of reach.
         """
-        if len(t) and t[0] < self._kept[0].t0:
+        if len(t) and t[0] < self._knots[0].t:
             raise IntegrationError(f't = {float(t[0])!r} s: steps go forward, and the oldest one '
-                                   f'that is kept begins at {self._kept[0].t0!r} s')
+                                   f'that is kept begins at {self._knots[0].t!r} s')
         parts, begin = [], 0
         while begin < len(t):
-            end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
+            end = int(np.searchsorted(t, self._knots[-1].t, 'right'))
             if end > begin:
                 parts.append(self._unknowns(t[begin:end]))
                 begin = end
             else:
-                self._forget(max(len(self._kept) - MOST_KEPT, 0))
+                self._forget(max(len(self._knots) - MOST_KEPT, 0))
                 self._take_steps(float(t[-1]))
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
-        return self._states_of(t.copy(), unknowns)
+        return self.columns(self, t.copy(), unknowns)
 
     def _take_steps(self, until: float) -> None:
         """Take STEPS_TOGETHER steps towards a time [s], or those that are missing."""
         try:
-            begin, taken = self._kept[-1].t1, 0
-            while taken < STEPS_TOGETHER and self._kept[-1].t1 < until:
+            begin, taken = self._knots[-1].t, 0
+            while taken < STEPS_TOGETHER and self._knots[-1].t < until:
                 self._take_step()
                 taken += 1
-            newest = self._kept[-1].t1
+            newest = self._knots[-1].t
             if until - newest > MOST_STEPS * (newest - begin) / taken:
                 raise IntegrationError(f't = {until:.9g} s is more than {MOST_STEPS:.0e} steps of '
                                        f"{(newest - begin) / taken:.3g} s away: use method = "
@@ -263,19 +255,19 @@ class SteppedMotion(Motion):
     def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], UnknownRows]:
         """Return in which of the steps that are kept times [s] lie, and the unknowns there."""
         first, last = (self._number(t[0]), self._number(t[-1])) if len(t) else (0, 0)
-        begin, y0, first0, end, y1, first1 = map(
-            components, zip(*self._kept[first:last + 1], strict=True))
-        h = end - begin
-        rise, p, q = y1 - y0, h * first0, h * first1
-        u = 0.5 * h * h * self.second_derivative(y0, first0)
-        v = 0.5 * h * h * self.second_derivative(y1, first1)
+        ends, y, first_derivative = map(components, zip(*self._knots[first:last + 2], strict=True))
+        h = np.diff(ends)
+        start, rise = y[:, :-1], np.diff(y)
+        p, q = h * first_derivative[:, :-1], h * first_derivative[:, 1:]
+        second = self.second_derivative(y, first_derivative)
+        u, v = 0.5 * h * h * second[:, :-1], 0.5 * h * h * second[:, 1:]
         # (6, k, steps), by powers of (t - begin)/length.
         coefficients = np.array((
-            y0, p, u,
+            start, p, u,
             10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
             -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
             6.0 * rise - 3.0 * p - 3.0 * q - u + v))
-        numbers = end.searchsorted(t)
-        s = (t - begin[numbers]) / np.where(h > 0.0, h, 1.0)[numbers]
+        numbers = ends[1:].searchsorted(t)
+        s = (t - ends[numbers]) / np.where(h > 0.0, h, 1.0)[numbers]
         c0, c1, c2, c3, c4, c5 = coefficients.take(numbers, axis=2)
         return first + numbers, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0

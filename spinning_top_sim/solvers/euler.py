@@ -25,6 +25,24 @@ SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
 ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 
 
+class _EulerStates(States):
+    method = 'rk45'
+
+    def __init__(self, motion: SteppedMotion, t: Column, unknowns: UnknownRows) -> None:
+        super().__init__(motion.top, motion.start, len(t))
+        theta, theta_dot, phi, psi = unknowns
+        self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        return attitude.quaternion_of_angles(*self.angles)
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        return attitude.transverse(self.theta_dot, self.phi_dot * np.sin(self.theta),
+                                   np.cos(self.psi), np.sin(self.psi))
+
+
 class EulerMotion(SteppedMotion):
     """
     Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
@@ -33,6 +51,8 @@ class EulerMotion(SteppedMotion):
     docs/theta_functions.md.  So they stop with an error there, and do not begin with a disc whose
     lambda3/lambda1 loses digits.
     """
+
+    columns = _EulerStates
 
     def __init__(self, top: Top, start: State, _: Posture, rtol: float, atol: float) -> None:
         if top.lambda3 > LARGEST_RATIO * top.lambda1:
@@ -89,24 +109,3 @@ class EulerMotion(SteppedMotion):
                 f'euler equations: a step leapt over a pole, from theta = {before!r} to '
                 f'{after!r} rad, and lost phi and psi; {ADVICE}')
         return y_new
-
-    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
-        return _EulerStates(self.top, self.start, t, unknowns)
-
-
-class _EulerStates(States):
-    method = 'rk45'
-
-    def __init__(self, top: Top, start: State, t: Column, unknowns: UnknownRows) -> None:
-        super().__init__(top, start, len(t))
-        theta, theta_dot, phi, psi = unknowns
-        self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
-
-    @cached_property
-    def rows_quaternion(self) -> Quaternion:
-        return attitude.quaternion_of_angles(*self.angles)
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        return attitude.transverse(self.theta_dot, self.phi_dot * np.sin(self.theta),
-                                   np.cos(self.psi), np.sin(self.psi))

@@ -26,14 +26,13 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import ThetaMotion
-from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
+from spinning_top_sim.solvers.multiprecision import precision
+from spinning_top_sim.solvers.theta import SIN_ODD
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
-# Smaller amplitudes leave no room for their squares in doubles.
-LEAST_AMPLITUDE = 1e-145
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
 SPLITTER = 134217729.0
 # Once glibc has freed a block of this size, it keeps freed memory for large arrays instead of
@@ -48,67 +47,23 @@ def halves(x: Number) -> tuple[Number, Number]:
     return high, x - high
 
 
-class ThetaArrays:
+class Phases:
     """
-    The constants of a motion in doubles.
+    The phases of nutation [quarter periods], and of alpha and beta [half turns].
 
-    phi_phase, psi_phase : phi and psi at t = 0 less the arguments of alpha and beta [rad]
-    sign, turn : theta is sign * (theta in [0, pi]) + turn, for a start beyond a pole
-
-    Raises ValueError if doubles cannot hold one.
+    rates : per second
+    wholes, rests : integers and what is left at t = 0
     """
 
-    def __init__(self, motion: ThetaMotion, start: State) -> None:
-        factors = alpha, beta = motion.alpha, motion.beta
-        self.phi_phase = float(start.phi - alpha.start_argument - beta.start_argument)
-        self.psi_phase = float(start.psi - alpha.start_argument + beta.start_argument)
-        self.turn = math.tau * round(start.theta / math.tau)
-        self.sign = -1.0 if start.theta < self.turn else 1.0
-        # (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
-        self.bottom_rate, self.top_rate = (float(x.pole_rate) for x in factors)
-        # The three phases at t = 0 are the sum of whole, offset and rest.
-        self._rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
-        turns = [2 * x.phase_turns for x in factors]
-        wholes = [motion.start_whole, *map(int, map(rint, turns))]
+    def __init__(self, rates: Sequence[mpfr], wholes: Sequence[int],
+                 rests: Sequence[mpfr]) -> None:
+        self._rates = rates
         self.start_wholes = np.array(wholes, np.float64)[:, np.newaxis]
-        self.start_offsets, self.start_rests = _columns(
-            [motion.start_offset, *map(sub, turns, wholes[1:])])
-        self.drifts = np.array([[0.5 * float(factor.drift)] for factor in factors])
-        self.stretch = QUARTER * float(motion.stretch) if motion.stretch else 0.0
-        # At even and at odd N, of the rows R of alpha and beta, s J of alpha and beta; the
-        # polynomials in xi have their highest power first, (k, 4, 2).
-        rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
-        self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
-        self.coefficients = _highest_first(
-            [float(scale * x) for x in one.polynomial(motion.size)]
-            for row, factor in zip(rows, 2 * factors, strict=True)
-            for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
-        for name, factor in (('alpha', alpha), ('beta', beta)):
-            size = min(abs(scale) * max(map(abs, real.weights)) for (real, _), scale in zip(
-                factor.parts, factor.scales, strict=True))
-            if 0 < size < LEAST_AMPLITUDE:
-                raise ValueError(
-                    f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
-                    f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
-        # 0 for alpha and 1 for beta: those with s = 0, and of those that pass their pole exactly,
-        # whether R = 0 at y = 0 is at even N (0) or at odd N (1).
-        self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
-        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
-                      if SIN_ODD in pair}
-        # The sense in which theta/2 goes round, if both poles are passed, and its start.
-        self.sense = math.copysign(1.0, start.theta_dot) * self.sign * (len(self.zeros) == 2)
-        self.start_half = 0.5 * abs(start.theta - self.turn)
-        self.u_dot = np.array([*map(float, motion.u_dot)])
-        self.u_dot_coefficients = _highest_first(
-            [[*map(float, motion.u_dot_series.polynomial(motion.size))]])
-        self.precession, self.swing = np.array(
-            [[*map(float, motion.precession)], [*map(float, motion.swing)]])
-        # Whether p + q theta1^2/D^2 loses no digits between the turning points; see `across`.
-        self.expands = self.u_dot.any() and not (self.stretch or self.on_line)
+        self._start_offsets, self._start_rests = _columns(rests)
         self._scaled: dict[int, list[Matrix]] = {}
 
-    def phases(self, per_second: int, t: Column,
-               ) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
+    def at(self, per_second: int, t: Column,
+           ) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
         """
         Return the three phases, (3, n) each; the arguments are those of `ExactStates`.
 
@@ -131,26 +86,63 @@ class ThetaArrays:
         rest += rate_low * t
         whole = np.rint(high)
         part = high - whole
-        shift = part + self.start_offsets
+        shift = part + self._start_offsets
         shift += rest
         np.rint(shift, out=shift)
         # No difference rounds where the result is small: its terms are within a factor of two of
         # each other then (Sterbenz).
         half = 0.5 * shift
         part -= half
-        half -= self.start_offsets
+        half -= self._start_offsets
         part -= half
-        part += rest + self.start_rests
+        part += rest + self._start_rests
         shift += self.start_wholes
         return high, rest, whole.astype(np.int64) + shift.astype(np.int64), part
 
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """The least and the greatest theta in [0, pi] [rad]."""
-        middles = np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T
-        low, high = sorted(2.0 * math.atan2(math.hypot(b, b_imag), math.hypot(a, a_imag))
-                           for a, b, a_imag, b_imag in middles.tolist())
-        return low, high
+
+class ThetaArrays:
+    """
+    The constants of a motion in doubles.
+
+    phi_phase, psi_phase : phi and psi at t = 0 less the arguments of alpha and beta [rad]
+    sign, turn : theta is sign * (theta in [0, pi]) + turn, for a start beyond a pole
+    on_line : 0 for alpha and 1 for beta: those that move on a line through zero, s = 0
+    zeros : those that pass zero, and whether R = 0 at y = 0 is at even N (0) or at odd N (1)
+    fall : of theta' sin(theta) = fall theta1(2y)/D^4, with the sign of sin(theta)
+    sense : in which theta/2 goes round if both poles are passed, else 0
+    """
+
+    def __init__(self, motion: ThetaMotion, start: State) -> None:
+        factors = alpha, beta = motion.alpha, motion.beta
+        self.phi_phase = float(start.phi - alpha.start_argument - beta.start_argument)
+        self.psi_phase = float(start.psi - alpha.start_argument + beta.start_argument)
+        self.turn = math.tau * round(start.theta / math.tau)
+        self.sign = -1.0 if start.theta < self.turn else 1.0
+        turns = [x.phase / const_pi() for x in factors]
+        wholes = [*map(int, map(rint, turns))]
+        self.phases = Phases(
+            [motion.quarter_rate, *(x.rate / const_pi() for x in factors)],
+            [motion.start_whole, *wholes], [motion.start_offset, *map(sub, turns, wholes)])
+        self.drifts = np.array([[0.5 * float(factor.drift)] for factor in factors])
+        self.stretch = QUARTER * float(motion.stretch)
+        # At even and at odd N, of the rows R of alpha and beta, s J of alpha and beta; the
+        # polynomials in xi have their highest power first, (k, 4, 2).
+        rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
+        self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
+        self.coefficients = _highest_first(
+            one.polynomial(motion.size) for row in rows for one in row).reshape(-1, 4, 2)
+        self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
+        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
+                      if SIN_ODD in pair}
+        # (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
+        self.pole_rates = [float(factor.pole_rate) for factor in factors]
+        self.sense = math.copysign(1.0, start.theta_dot) * self.sign * (len(self.zeros) == 2)
+        self.start_half = 0.5 * abs(start.theta - self.turn)
+        # At even and at odd N
+        _, self.precession, self.swing, u_dot = np.array(
+            [[*map(float, one)] for one in motion.turning]).T
+        self.fall = -self.sign * u_dot
+        self.theta1 = _highest_first([motion.theta1.polynomial(motion.size)])
 
 
 class ExactStates(States):
@@ -168,7 +160,7 @@ class ExactStates(States):
         super().__init__(top, start, len(t))
         self.t = t / per_second
         self._arrays = arrays
-        self._turned, self._turned_rest, whole, part = arrays.phases(per_second, t)
+        self._turned, self._turned_rest, whole, part = arrays.phases.at(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
@@ -235,7 +227,7 @@ class ExactStates(States):
         half = np.arctan2(self.moduli[1], self.moduli[0])
         if arrays.sense:        # by less than half a turn it differs from this
             turned = arrays.start_half + arrays.sense * QUARTER * (
-                self._quarters - arrays.start_wholes[0])
+                self._quarters - arrays.phases.start_wholes[0])
             half += math.tau * np.rint((turned - half) / math.tau)
         return (math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
                 + ((arguments[0] + arguments[1]) + arrays.phi_phase),
@@ -245,15 +237,9 @@ class ExactStates(States):
 
     @cached_property
     def theta_dot(self) -> Column:
-        theta_dot: Column = self._arrays.sign * self.tilt_rate
-        return theta_dot
-
-    @cached_property
-    def tilt_rate(self) -> Column:
-        """The rate of theta in [0, pi] [rad/s], continued through a pole that is passed."""
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
-        if not arrays.u_dot.any():      # it rests, perhaps at a pole
+        if not arrays.fall.any():       # it rests, perhaps at a pole
             return np.zeros(len(xi))
         size, without = alpha * alpha + beta * beta, [alpha, beta]
         prefactor = self._sin_y * self._cos_y
@@ -261,9 +247,9 @@ class ExactStates(States):
             here = self._parity == parity
             prefactor = np.where(here, self._cos_y, prefactor)
             without[k] = np.where(here, self._without_zero[k], without[k])
-        series = prefactor * _horner(arrays.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
+        series = prefactor * _horner(arrays.theta1, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        rate: Column = -arrays.u_dot.take(self._parity) * (series / size) / (
+        rate: Column = arrays.fall.take(self._parity) * (series / size) / (
             without[0] * without[1])
         return rate
 
@@ -272,22 +258,23 @@ class ExactStates(States):
         """
         Phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) [rad/s].
 
-        In half angles nothing cancels near a pole, and of a fast top nothing in the series, whose
-        quarter periods are divided where u is half way: m is at most 1/2.
+        In half angles nothing cancels near a pole.  In the real form nothing cancels, of a fast
+        top either, in what has been added since the nearest turning point.
         """
         arrays, (alpha, beta) = self._arrays, self.moduli
-        if arrays.expands:
-            series = self._sin_y * _horner(arrays.u_dot_coefficients, self._xi)
-            momentum = (arrays.precession.take(self._parity) * (alpha * alpha + beta * beta)
-                        + arrays.swing.take(self._parity) * (series * series))
-            slow: Column = 0.5 * momentum / (alpha * beta)
-            return slow
-        rate = np.zeros(len(alpha))
-        if arrays.bottom_rate:
-            rate += arrays.bottom_rate * (beta / alpha)
-        if arrays.top_rate:
-            rate += arrays.top_rate * (alpha / beta)
-        return rate
+        if arrays.stretch or arrays.on_line:
+            across = np.zeros(len(alpha))
+            of_alpha, of_beta = arrays.pole_rates
+            if of_alpha:
+                across += of_alpha * (beta / alpha)
+            if of_beta:
+                across += of_beta * (alpha / beta)
+            return across
+        series = self._sin_y * _horner(arrays.theta1, self._xi)
+        momentum = (arrays.precession.take(self._parity) * (alpha * alpha + beta * beta)
+                    + arrays.swing.take(self._parity) * (series * series))
+        slow: Column = 0.5 * momentum / (alpha * beta)
+        return slow
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
@@ -298,8 +285,9 @@ class ExactStates(States):
         cos, sin = real / moduli, imag / moduli
         for k in self._arrays.on_line:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
-        return attitude.transverse(self.tilt_rate, self.across, cos[0] * cos[1] + sin[0] * sin[1],
-                                   sin[0] * cos[1] - cos[0] * sin[1])
+        return attitude.transverse(
+            self._arrays.sign * self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
+            sin[0] * cos[1] - cos[0] * sin[1])
 
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:
@@ -308,11 +296,11 @@ def _columns(numbers: Sequence[mpfr]) -> Matrix:
     return np.array([high, [*map(float, map(sub, numbers, high))]])[:, :, np.newaxis]
 
 
-def _highest_first(polynomials: Iterable[list[float]]) -> Matrix:
-    """Return coefficients with the highest of at least 2 powers first, (k, n)."""
-    polynomials = [*polynomials]
-    size = max(2, *map(len, polynomials))
-    return np.array([(size - len(one)) * [0.0] + one[::-1] for one in polynomials]).T
+def _highest_first(polynomials: Iterable[Sequence[mpfr]]) -> Matrix:
+    """Return coefficients in doubles, with the highest of at least 2 powers first, (k, n)."""
+    doubles = [[*map(float, one)] for one in polynomials]
+    size = max(2, *map(len, doubles))
+    return np.array([(size - len(one)) * [0.0] + one[::-1] for one in doubles]).T
 
 
 def _horner(coefficients: Matrix, xi: Column) -> Matrix:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
+from gmpy2 import mpfr
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
@@ -20,16 +20,15 @@ from spinning_top_sim.physics.regimes import (
     Description,
     axis_rests,
     precession_extremes,
-    precession_momentum,
     regime,
 )
 from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
+from spinning_top_sim.solvers.constants import precise, set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
 from spinning_top_sim.solvers.motion import Motion
-from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
-from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
+from spinning_top_sim.solvers.multiprecision import precision
+from spinning_top_sim.solvers.vertical import Posture, Vertical
 from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -70,13 +69,11 @@ class ExactSolution(Motion):
 
     is_exact = True
 
-    def __init__(self, top: Top, start: State | PreciseState,
-                 gravity: mpfr | None = None) -> None:
-        # A motion about another vertical has its start and its `gravity` in multiprecision.
-        super().__init__(top, start if isinstance(start, State) else start.rounded())
+    def __init__(self, top: Top, start: State | Posture, gravity: mpfr | None = None) -> None:
         self._given = start
         with precision():
-            self._motion = motion = set_up(top, self._given, gravity)
+            super().__init__(top, start if isinstance(start, State) else start.state(top))
+            self._motion = motion = set_up(top, start, gravity)
             alpha, beta = motion.alpha, motion.beta
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
@@ -86,7 +83,7 @@ class ExactSolution(Motion):
                 abs(float(motion.quarter_rate)), 1e-290,
                 (abs(self.mean_precession_rate) + abs(self.mean_spin_rate)) / (4.0 * math.pi))
             self.arrays = ThetaArrays(motion, self.start)
-        self.theta_min, self.theta_max = self.arrays.bounds
+        self.theta_min, self.theta_max = sorted(one.tilt for one in motion.turning)
 
     def describe(self, coincide: float = COINCIDE) -> Description:
         """
@@ -135,18 +132,9 @@ class ExactSolution(Motion):
         They are right to 38 digits, times what the motion makes of such an error.
         """
         with precision():
-            start = precise(self._given)
-            found = start.posture(self.top)
+            found = precise(self.top, self._given)
             if t_ns:                # perhaps at a pole, where the axis does not tell its rates
-                alpha, beta, u_dot = _at(self._motion, mpfr(t_ns) / NANOSECONDS)
-                # omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); where
-                # the axis rests at a pole it is 0.
-                product, transverse = 2 * alpha * beta.conjugate(), mpc(0)
-                if abs(product):        # a zero mpc is true
-                    momentum = precession_momentum(start.l3, start.lz, abs(beta) ** 2,
-                                                   abs(alpha) ** 2)
-                    transverse = -(momentum / mpfr(self.top.lambda1) + 1j * u_dot) / product
-                found = Posture(alpha, beta, transverse, found.l3)
+                found = Posture(*self._motion.at(mpfr(t_ns) / NANOSECONDS), found.l3)
             return vertical.to_world(found) if vertical else found
 
 
@@ -154,33 +142,6 @@ def exact_about(top: Top, start: State | Posture,
                 acceleration: Fractions) -> tuple[ExactSolution, Vertical]:
     """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
     with precision():
-        posture = start if isinstance(start, Posture) else precise(start).posture(top)
         vertical = Vertical.of(top, acceleration, mpfr)
-        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture))
-    return ExactSolution(vertical.top, state, vertical.gravity), vertical
-
-
-def _at(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
-    """Return alpha, beta and cos(theta)' of a motion at t [s], in multiprecision."""
-    quarters = motion.start_whole + motion.start_offset + motion.quarter_rate * t
-    whole = int(rint(quarters))
-    y = const_pi() / 2 * ((motion.start_whole - whole) + motion.quarter_rate * t
-                          + motion.start_offset)
-    sine = sinh(motion.stretch * y) if motion.stretch else sin_cos(y)[0]
-    xi = -sine * sine if motion.stretch else sine * sine
-    point = sine, sqrt(1 - xi), xi
-
-    def value(factor: Factor) -> mpc:
-        """Return alpha D or beta D."""
-        real, imag = (factor.scales[whole % 2] * part.at(*point)
-                      for part in factor.parts[whole % 2])
-        if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
-            real = -real                # it passes a pole
-        sin, cos = sin_cos(
-            factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y)
-        return (real + 1j * imag) * (cos + 1j * sin)
-
-    alpha, beta = value(motion.alpha), value(motion.beta)
-    size = sqrt(abs(alpha) ** 2 + abs(beta) ** 2)
-    slope = motion.u_dot_series.at(2 * sine * point[1], 1 - 2 * xi, 4 * xi * (1 - xi))
-    return alpha / size, beta / size, motion.u_dot[whole % 2] * slope / size ** 4
+        posture = vertical.to_frame(precise(top, start))
+    return ExactSolution(vertical.top, posture, vertical.gravity), vertical

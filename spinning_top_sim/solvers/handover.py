@@ -19,7 +19,7 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.solve import motion_of
-from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
+from spinning_top_sim.solvers.vertical import Posture, Vertical
 from spinning_top_sim.times import NANOSECONDS, Times, ns_array
 
 # Stamps of ROS end at 2^31 s, and doubles hold phases up to 2^52.  The fastest one is that of the
@@ -53,7 +53,7 @@ class Piece:
         self.rests = ride is pivot.REST and isinstance(start, State)
         try:
             with np.errstate(over='ignore', invalid='ignore'):
-                posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
+                posture = (Posture.of(top, start) if isinstance(start, State)
                            else start.in_doubles())
                 self.motion, self._vertical = self._solution(posture, method, settings)
                 top, begin = self.motion.top, self.motion.start     # in effective gravity
@@ -80,9 +80,7 @@ class Piece:
                 from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
             return exact_about(top, start, self.ride.acceleration)
         vertical = Vertical.of(top, self.ride.acceleration, float)
-        posture = vertical.to_frame(posture)
-        state = PreciseState.of_posture(vertical.top, posture).rounded()
-        return motion_of(vertical.top, state, method=method, posture=posture,
+        return motion_of(vertical.top, vertical.to_frame(posture), method=method,
                          **settings), vertical
 
     def states(self, t_ns: Times | range) -> States:
@@ -131,5 +129,4 @@ class Piece:
         """Return this motion where the pivot has the same acceleration till another end."""
         changed = copy(self)
         changed.ride = ride
-        changed.__dict__.pop('exact', None)     # it has the old ride
         return changed

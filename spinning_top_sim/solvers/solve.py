@@ -18,7 +18,7 @@ from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.transport import TransportMotion
-from spinning_top_sim.solvers.vertical import Posture, PreciseState
+from spinning_top_sim.solvers.vertical import Posture
 
 # Doubles do not hold the squares of larger rates [rad/s]; those of the spin are smaller anyway.
 FASTEST_AXIS = 1e100
@@ -33,24 +33,21 @@ def _closed_form(top: Top, start: State, *_: Any) -> Motion:
     return ExactSolution(top, start)
 
 
-def _steps(top: Top, start: State, equations: str, *others: Any) -> Motion:
-    return EQUATIONS[equations](top, start, *others)
-
-
 # They make a motion of the top, the start, the name of equations, and what these take.
-METHODS: Mapping[str, Callable[..., Motion]] = {'rk45': _steps, 'exact': _closed_form}
+METHODS: Mapping[str, Callable[..., Motion]] = {
+    'rk45': lambda top, start, equations, *others: EQUATIONS[equations](top, start, *others),
+    'exact': _closed_form}
 
 
-def motion_of(top: Top, start: State, *, method: str, equations: str = 'transport',
-              rtol: Any = 1e-11, atol: Any = None,
-              posture: Posture | None = None) -> Motion:
+def motion_of(top: Top, start: State | Posture, *, method: str, equations: str = 'transport',
+              rtol: Any = 1e-11, atol: Any = None) -> Motion:
     """
     Return the motion that begins at `start`; `solve` explains the settings.
 
     Motions without torque or nutation take no steps: 'rk45' leaves them to the closed form, where
     that can hold them and gmpy2 is installed.
 
-    posture : of `start` in the same frame, in doubles that know more of it
+    start : a posture is in doubles
 
     Raises ValueError for a bad setting, or a motion that doubles cannot hold.
     """
@@ -62,14 +59,16 @@ def motion_of(top: Top, start: State, *, method: str, equations: str = 'transpor
         if not (isinstance(value, int | float) and least <= value <= 1e-2):
             raise ValueError(f'{name} = {shown(value)}: must be in [{least:g}, 1e-2]')
     try:
-        now = posture or PreciseState.of(start).posture(top)
+        now = Posture.of(top, start) if isinstance(start, State) else start
         if not abs(now.transverse) <= FASTEST_AXIS:
             raise OverflowError
     except ArithmeticError:
         raise ValueError(f'{top} from {start}: the rate of the axis must be at most '
                          f'{FASTEST_AXIS:g} rad/s') from None
+    if isinstance(start, Posture):
+        start = now.state(top)
     # Rounded to a state beside a pole, a posture that moves a little would rest.
-    if method == 'rk45' and equations == 'transport' and posture is None and (
+    elif method == 'rk45' and equations == 'transport' and (
             top.gravity_torque == 0.0 or axis_rests(top, start)):
         with suppress(ImportError, ValueError):
             return _closed_form(top, start)

@@ -34,6 +34,77 @@ COLUMNS: Functions = np.sqrt, np.copysign, np.where
 ONE_STATE: Functions = math.sqrt, math.copysign, lambda condition, x, y: x if condition else y
 
 
+def turns_to_follow(phase: Column, before: Column, sense: float) -> Column:
+    """
+    Return the whole turns to add to `phase` so that it follows `before` [rad].
+
+    In this sense, but for rounding; without one (0) it is the nearest.
+    """
+    return 0.0 - np.rint((phase - before - 0.5 * math.pi * sense) / math.tau)
+
+
+class _TransportStates(States):
+    """States known by what `TransportMotion._unknowns` returns."""
+
+    method = 'rk45'
+
+    def __init__(self, motion: 'TransportMotion', t: Column, rows: UnknownRows) -> None:
+        super().__init__(motion.top, motion.start, len(t))
+        self.t, self._motion = t, motion
+        self._stepped: Components = tuple(rows[:6])
+        self._phases_before = rows[6:]
+
+    @cached_property
+    def _projected(self) -> Components:
+        """The unknowns on the invariants, in the body's own frame."""
+        a, b, c, d, m_real, m_imag = self._motion.project(self._stepped)
+        spin = 0.5 * self._motion.spin_rate * self.t
+        cosine, sine = np.cos(spin), np.sin(spin)
+        return (a * cosine - b * sine, b * cosine + a * sine,
+                c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        alpha_real, alpha_imag, beta_real, beta_imag, *_ = self._projected
+        return -beta_imag, beta_real, alpha_imag, alpha_real
+
+    @cached_property
+    def angles(self) -> tuple[Column, Column, Column]:
+        uniform = self._motion.uniform_rates[1] * self.t
+        phases = self._motion.phases(self._projected, uniform)
+        # theta/2 turns by less than half a turn within a step.
+        half_sum, half_difference, half = (
+            phase + math.tau * turns_to_follow(phase, before, sense)
+            for phase, before, sense in zip(
+                phases, self._phases_before, self._motion.senses, strict=True))
+        half_sum, half_difference = half_sum + uniform, half_difference - uniform
+        return half_sum + half_difference, 2.0 * half, half_sum - half_difference
+
+    @cached_property
+    def _momentum(self) -> tuple[Column, Column]:
+        """L_x and L_y in the world frame [kg m^2/s]."""
+        unit, (*_, m_real, m_imag) = 2.0 * self.top.lambda1, self._projected
+        return unit * m_imag, -unit * m_real
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        """The momentum across the meridian plane, over lambda1."""
+        lx, ly = self._momentum
+        return (ly * np.cos(self.phi) - lx * np.sin(self.phi)) / self.top.lambda1
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        momentum = *self._momentum, self.start.lz
+        first, second, _ = attitude.rotated_back(self.rows_quaternion, momentum)
+        return first / self.top.lambda1, second / self.top.lambda1
+
+    @cached_property
+    def l3(self) -> Column:
+        x, y, z = self.rows_axis
+        lx, ly = self._momentum
+        return lx * x + ly * y + self.start.lz * z
+
+
 class TransportMotion(SteppedMotion):
     """
     Regular at every attitude; docs/theta_functions.md derives these equations.
@@ -61,6 +132,8 @@ class TransportMotion(SteppedMotion):
     posture : of `start`, in doubles that know more of it
     """
 
+    columns = _TransportStates
+
     def __init__(self, top: Top, start: State, posture: Posture, rtol: float,
                  atol: float) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
@@ -73,7 +146,7 @@ class TransportMotion(SteppedMotion):
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, transverse, _ = posture
+        alpha, beta, transverse, *_ = posture
         # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
         m = 0.5j * (alpha * alpha * transverse - beta * beta * transverse.conjugate()
                     + 2.0 * alpha * beta * (l3 / lambda1))
@@ -182,10 +255,10 @@ class TransportMotion(SteppedMotion):
 
     def _unwrap(self) -> None:
         """Follow the phases to the begins of all steps that are kept."""
-        new = self._kept[self._phases_at_steps.shape[1]:]
+        new = self._knots[self._phases_at_steps.shape[1]:]
         if new:
-            t = np.array([step.t0 for step in new])
-            y = tuple(components([step.y0 for step in new]))
+            times, vectors, _ = zip(*new, strict=True)
+            t, y = np.array(times), tuple(components(vectors))
             phases = self.phases(y, self.uniform_rates[0] * t)
             self._phases_at_steps = np.concatenate((self._phases_at_steps, [
                 phase + math.tau * np.cumsum(turns_to_follow(
@@ -203,77 +276,3 @@ class TransportMotion(SteppedMotion):
         self._unwrap()
         steps, unknowns = self._interpolated(t)
         return np.concatenate((unknowns, self._phases_at_steps.take(steps, axis=1)))
-
-    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
-        return _TransportStates(self, t, unknowns)
-
-
-def turns_to_follow(phase: Column, before: Column, sense: float) -> Column:
-    """
-    Return the whole turns to add to `phase` so that it follows `before` [rad].
-
-    In this sense, but for rounding; without one (0) it is the nearest.
-    """
-    return 0.0 - np.rint((phase - before - 0.5 * math.pi * sense) / math.tau)
-
-
-class _TransportStates(States):
-    """States known by what `TransportMotion._unknowns` returns."""
-
-    method = 'rk45'
-
-    def __init__(self, motion: TransportMotion, t: Column, rows: UnknownRows) -> None:
-        super().__init__(motion.top, motion.start, len(t))
-        self.t, self._motion = t, motion
-        self._stepped: Components = tuple(rows[:6])
-        self._phases_before = rows[6:]
-
-    @cached_property
-    def _projected(self) -> Components:
-        """The unknowns on the invariants, in the body's own frame."""
-        a, b, c, d, m_real, m_imag = self._motion.project(self._stepped)
-        spin = 0.5 * self._motion.spin_rate * self.t
-        cosine, sine = np.cos(spin), np.sin(spin)
-        return (a * cosine - b * sine, b * cosine + a * sine,
-                c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
-
-    @cached_property
-    def rows_quaternion(self) -> Quaternion:
-        alpha_real, alpha_imag, beta_real, beta_imag, *_ = self._projected
-        return -beta_imag, beta_real, alpha_imag, alpha_real
-
-    @cached_property
-    def angles(self) -> tuple[Column, Column, Column]:
-        uniform = self._motion.uniform_rates[1] * self.t
-        phases = self._motion.phases(self._projected, uniform)
-        # theta/2 turns by less than half a turn within a step.
-        half_sum, half_difference, half = (
-            phase + math.tau * turns_to_follow(phase, before, sense)
-            for phase, before, sense in zip(
-                phases, self._phases_before, self._motion.senses, strict=True))
-        half_sum, half_difference = half_sum + uniform, half_difference - uniform
-        return half_sum + half_difference, 2.0 * half, half_sum - half_difference
-
-    @cached_property
-    def _momentum(self) -> tuple[Column, Column]:
-        """L_x and L_y in the world frame [kg m^2/s]."""
-        unit, (*_, m_real, m_imag) = 2.0 * self.top.lambda1, self._projected
-        return unit * m_imag, -unit * m_real
-
-    @cached_property
-    def theta_dot(self) -> Column:
-        """The momentum across the meridian plane, over lambda1."""
-        lx, ly = self._momentum
-        return (ly * np.cos(self.phi) - lx * np.sin(self.phi)) / self.top.lambda1
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        momentum = *self._momentum, self.start.lz
-        first, second, _ = attitude.rotated_back(self.rows_quaternion, momentum)
-        return first / self.top.lambda1, second / self.top.lambda1
-
-    @cached_property
-    def l3(self) -> Column:
-        x, y, z = self.rows_axis
-        lx, ly = self._momentum
-        return lx * x + ly * y + self.start.lz * z

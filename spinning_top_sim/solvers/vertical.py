@@ -34,102 +34,86 @@ POLE_IN_BITS, POLE_IN_DOUBLES = 1e-30, 1.5e-8
 
 class Posture(NamedTuple):
     """
-    Attitude and angular velocity at one instant.
+    Attitude and angular velocity at one instant, in any numbers.
 
     alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
     transverse : omega_1 + i omega_2 in the body [rad/s]
     l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
+    theta_dot, lz : of a `State` about the same vertical, which the others tell to fewer digits
     """
 
     alpha: Complex
     beta: Complex
     transverse: Complex
-    l3: float
+    l3: Real
+    theta_dot: Real | None = None
+    lz: Real | None = None
+
+    @classmethod
+    def of(cls, top: Top, state: State, real: Callable[[Any], Real] = float,
+           sin_cos: Callable[[Real], tuple[Real, Real]] = lambda x: (math.sin(x), math.cos(x)),
+           ) -> Posture:
+        """Return that of a state, which may be continued, in numbers with this sine and cosine."""
+        half, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
+        (sine, cosine), *others = map(sin_cos, (half, phi + psi, phi - psi))
+        alpha, beta = (z / abs(z) for z in (cos + 1j * sin for sin, cos in others))
+        theta_dot, l3, lz = map(real, (state.theta_dot, state.l3, state.lz))
+        across = 2 * sine * cosine * attitude.precession_rate(      # phi' sin(theta)
+            top, l3, lz, cosine * cosine, sine * sine)
+        transverse = (1j * theta_dot - across) * beta * alpha.conjugate()   # exp(-i psi)
+        return cls(cosine * alpha, sine * beta, transverse, l3,
+                   -theta_dot if (sine < 0) != (cosine < 0) else theta_dot, lz)
 
     def in_doubles(self) -> Posture:
-        return Posture(complex(self.alpha), complex(self.beta), complex(self.transverse), self.l3)
+        return Posture(complex(self.alpha), complex(self.beta), complex(self.transverse),
+                       float(self.l3))
 
+    def turned(self, a: Complex, b: Complex) -> Posture:
+        """Return this posture after a rotation with the Cayley-Klein parameters a and b."""
+        return Posture(a * self.alpha - b * self.beta.conjugate(),
+                       a * self.beta + b * self.alpha.conjugate(), self.transverse, self.l3)
 
-def _sin_cos(angle: float) -> tuple[float, float]:
-    return math.sin(angle), math.cos(angle)
-
-
-class PreciseState(NamedTuple):
-    """
-    A state about some vertical, in any numbers.
-
-    sin_half, cos_half : of theta/2, with theta in [0, pi]
-    alpha, beta : complex numbers of any modulus with the arguments (phi + psi)/2, (phi - psi)/2
-    """
-
-    sin_half: Real
-    cos_half: Real
-    theta_dot: Real
-    alpha: Complex
-    beta: Complex
-    l3: Real
-    lz: Real
-
-    @classmethod
-    def of(cls, state: State, real: Callable[[Any], Real] = float,
-           sin_cos: Callable[[Real], tuple[Real, Real]] = _sin_cos) -> PreciseState:
-        """Return a state, perhaps a continued one, in numbers with this sine and cosine."""
-        theta, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
-        alpha, beta = (cos + 1j * sin for sin, cos in map(sin_cos, (phi + psi, phi - psi)))
-        (sine, cosine), theta_dot = sin_cos(theta), real(state.theta_dot)
-        if sine < 0:
-            sine, beta, theta_dot = -sine, -beta, -theta_dot
-        if cosine < 0:
-            cosine, alpha, theta_dot = -cosine, -alpha, -theta_dot
-        return cls(sine, cosine, theta_dot, alpha, beta, real(state.l3), real(state.lz))
-
-    @classmethod
-    def of_posture(cls, top: Top, posture: Posture, pole: float = POLE_IN_BITS) -> PreciseState:
+    def polar(self, top: Top, pole: float = POLE_IN_BITS) -> tuple[Real, ...]:
         """
-        Return the state of a posture about the same vertical.
+        Return sin(theta/2), cos(theta/2), theta', Lz and two numbers, about the same vertical.
 
-        A vertical axis has no precession angle of its own: there the angle is that of the line
-        about which the axis turns, so that all of this motion is nutation.
+        theta is in [0, pi], and the arguments of the complex numbers, which have any modulus, are
+        (phi + psi)/2 and (phi - psi)/2.  A vertical axis has no precession angle of its own: there
+        it is that of the line about which the axis turns, so that all of this motion is nutation.
 
-        pole : within which tilt the axis is vertical [rad]
+        pole : within which tilt an axis that is not that of a state is vertical [rad]
         """
-        alpha, beta, transverse, _ = posture
-        cosine2, sine2 = _norm(alpha), _norm(beta)
-        size2 = cosine2 + sine2
-        cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
-        none = 0 * sine
-        l3 = posture.l3 + none          # in numbers of the same kind
-        if 2 * min(sine, cosine) < pole:
-            rate = abs(transverse)
-            turn = -1j * transverse if rate else 1 + 0j         # exp(-i psi) theta'
+        alpha, beta, transverse, l3, theta_dot, lz = self
+        cosine, sine, size2 = abs(alpha), abs(beta), 1
+        if lz is None:          # after turns the length is 1 but for rounding
+            cosine2, sine2 = (alpha * alpha.conjugate()).real, (beta * beta.conjugate()).real
+            size2 = cosine2 + sine2
+            cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
+        l3 += 0 * sine          # in numbers of the same kind
+        tilt = 2 * min(sine, cosine)
+        if not tilt or (lz is None and tilt < pole):
+            rate = abs(transverse) if theta_dot is None else theta_dot
+            turn = -1j * transverse / rate if rate else 1 + 0j      # exp(-i psi)
+            none = 0 * sine
             if sine < cosine:
-                return cls(none, 1 + none, rate, alpha, alpha * turn, l3, l3)
-            return cls(1 + none, none, rate, beta * turn.conjugate(), beta, l3, -l3)
-        # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
-        # + i theta') exp(-i psi)
-        rates = transverse * (alpha * beta.conjugate()) / (cosine * sine * size2)
-        lz = (cosine - sine) * (cosine + sine) * l3 - (
-            2 * top.lambda1 * rates.real * cosine * sine)
-        return cls(sine, cosine, rates.imag, alpha, beta, l3, lz)
+                return none, 1 + none, rate, l3, alpha, alpha * turn
+            return 1 + none, none, rate, -l3, beta * turn.conjugate(), beta
+        if theta_dot is None or lz is None:
+            # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
+            # + i theta') exp(-i psi)
+            rates = transverse * (alpha * beta.conjugate()) / (cosine * sine * size2)
+            theta_dot, lz = rates.imag, (cosine - sine) * (cosine + sine) * l3 - (
+                2 * top.lambda1 * rates.real * cosine * sine)
+        return sine, cosine, theta_dot, lz, alpha, beta
 
-    def posture(self, top: Top) -> Posture:
-        """Return the posture about the same vertical."""
-        alpha, beta = (z / abs(z) for z in (self.alpha, self.beta))
-        cosine, sine = self.cos_half, self.sin_half
-        across = 2 * sine * cosine * attitude.precession_rate(      # phi' sin(theta)
-            top, self.l3, self.lz, cosine * cosine, sine * sine)
-        # exp(-i psi)
-        return Posture(cosine * alpha, sine * beta,
-                       (1j * self.theta_dot - across) * beta * alpha.conjugate(), float(self.l3))
-
-    def rounded(self) -> State:
-        """Return the state in doubles."""
-        alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in (self.alpha, self.beta))
-        theta = 2.0 * math.atan2(float(self.sin_half), float(self.cos_half))
-        pole = pole_momentum(theta, float(self.l3))
-        return State(theta=theta, theta_dot=float(self.theta_dot), phi=alpha + beta,
-                     psi=alpha - beta, l3=float(self.l3),
-                     lz=float(self.lz) if pole is None else pole)
+    def state(self, top: Top, pole: float = POLE_IN_BITS) -> State:
+        """Return the state about the same vertical; the arguments are those of `polar`."""
+        sine, cosine, theta_dot, lz, *numbers = self.polar(top, pole)
+        alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in numbers)
+        theta, l3 = 2.0 * math.atan2(float(sine), float(cosine)), float(self.l3)
+        lz_at_pole = pole_momentum(theta, l3)
+        return State(theta=theta, theta_dot=float(theta_dot), phi=alpha + beta, psi=alpha - beta,
+                     l3=l3, lz=float(lz) if lz_at_pole is None else lz_at_pole)
 
 
 class Vertical(NamedTuple):
@@ -172,11 +156,11 @@ class Vertical(NamedTuple):
 
     def to_frame(self, posture: Posture) -> Posture:
         """Return a posture in the world as one in this frame."""
-        return _turned(posture, self.alpha.conjugate(), -self.beta)
+        return posture.turned(self.alpha.conjugate(), -self.beta)
 
     def to_world(self, posture: Posture) -> Posture:
         """Return a posture in this frame as one in the world."""
-        return _turned(posture, self.alpha, self.beta)
+        return posture.turned(self.alpha, self.beta)
 
 
 def state_of(top: Top, quaternion: NDArray[np.float64],
@@ -192,14 +176,4 @@ def state_of(top: Top, quaternion: NDArray[np.float64],
     w1, w2, w3 = (float(part) for part in attitude.rotated_back(
         unit, angular_velocity.tolist()))
     posture = Posture(complex(w, z), complex(y, -x), complex(w1, w2), top.lambda3 * w3)
-    return PreciseState.of_posture(top, posture, pole=POLE_IN_DOUBLES).rounded()
-
-
-def _norm(z: Complex) -> Real:
-    return (z * z.conjugate()).real
-
-
-def _turned(posture: Posture, a: Complex, b: Complex) -> Posture:
-    """Return a posture after a rotation with the Cayley-Klein parameters a and b."""
-    alpha, beta, *rest = posture
-    return Posture(a * alpha - b * beta.conjugate(), a * beta + b * alpha.conjugate(), *rest)
+    return posture.state(top, POLE_IN_DOUBLES)

@@ -22,7 +22,7 @@ from spinning_top_sim.physics.states import Point, States, joined
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
-from spinning_top_sim.solvers.vertical import Posture, PreciseState
+from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.times import Times
 
@@ -110,8 +110,8 @@ class Trajectory:
     def momenta(self, t_ns: int) -> tuple[float, float]:
         """Return L3, and Lz about the vertical of the world, after a time [kg m^2/s]."""
         piece = self.after(t_ns)
-        now = piece.motion.start if piece.rests else PreciseState.of_posture(
-            self.top, piece.posture(t_ns).in_doubles())
+        now = (piece.motion.start if piece.rests
+               else piece.posture(t_ns).in_doubles().state(self.top))
         return now.l3, now.lz
 
     def starts(self, begin_ns: int, end_ns: int) -> list[int]:
