@@ -74,8 +74,6 @@ def limited():
 @pytest.mark.parametrize(('part', 'seed'), [
     (part, seed) for part, seeds in SEEDS.items() for seed in seeds])
 def test_a_seed_of_a_part_of_make_stress(tmp_path, limited, part, seed):
-    if part == 'logs':
-        pytest.importorskip('rclpy')
     module = importlib.import_module(f'stress.{part}')
     limited(module)
     module.check(seed, tmp_path)

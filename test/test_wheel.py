@@ -1,47 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source distribution, and what is said where extras are missing; .ci/wheel installs it."""
+"""What is said where extras are missing; .ci/wheel tests the wheel and the source distribution."""
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
-import zipfile
-from importlib import metadata
 
 from helpers.reference import ROOT
 
 from spinning_top_sim.__main__ import COMMANDS, main
-
-NAME = 'spinning_top_sim'
-BUILD = 'import sys, setuptools.build_meta as m; getattr(m, sys.argv[1])(sys.argv[2])'
-
-
-def test_the_source_distribution_installs_what_the_checkout_does(tmp_path):
-    """Here the package is installed from the checkout."""
-    settings = tmp_path / 'setup.cfg'
-    settings.write_text(f'[build]\nbuild_base={tmp_path}/b\n[egg_info]\negg_base={tmp_path}\n')
-
-    def build(what, place):
-        subprocess.run([sys.executable, '-c', BUILD, what, tmp_path], cwd=place, check=True,
-                       timeout=120, env={**os.environ, 'DIST_EXTRA_CONFIG': str(settings)})
-
-    build('build_sdist', ROOT)
-    shutil.unpack_archive(*tmp_path.glob('*.tar.gz'), tmp_path)
-    build('build_wheel', *tmp_path.glob('spinning_top_sim-*/'))
-    folder = metadata.distribution(NAME).locate_file('')
-    with zipfile.ZipFile(*tmp_path.glob('*.whl')) as archive:
-        of_sdist = {
-            os.path.normpath(folder / re.sub('.*[.]data/data/', '../../../', name)):
-            archive.read(name) for name in archive.namelist() if '.dist-info/' not in name}
-    of_checkout = {
-        os.path.normpath(file.locate()): file.locate().read_bytes()
-        for file in metadata.files(NAME) if '.dist-info/' not in str(file)
-        and file.suffix != '.pyc' and file.parent.name != 'bin'}
-    assert of_sdist == of_checkout
-    assert str(folder / NAME / 'py.typed') in of_sdist
-
 
 # Commands, and the extra that they need.
 REMEDIES = [
