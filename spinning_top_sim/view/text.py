@@ -35,17 +35,13 @@ def words(track: Track, t_ns: int) -> str:
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
                        ('attitude', ''))
-    rows = [*_rows(track.top, motion)] if motion else []
-    place = track.state(sample_ns).pivot.position[:, 0]
-    if place.any():
-        rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
         f'<div class="top-words" data-from="{t_ns / NANOSECONDS}">',
         f'<h1>{title}</h1>',
         *(f'<p>{html.escape(line)}</p>' for line in (sentence, track.about) if line),
         '<table>',
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
-          for label, value, note in rows),
+          for label, value, note in (_rows(track.top, motion) if motion else ())),
         f'</table><p class="stamp" data-epoch="{track.epoch_ns}">t = '
         f'{sample_ns / NANOSECONDS:.3f} s, stamp {stamp_text(track.epoch_ns + sample_ns)}</p>',
         '</div>'))
