@@ -189,7 +189,7 @@ def test_a_fast_motion_has_its_peaks_and_its_trace(changes):
     for peaks, peak in ((map(np.min, nutations[1:]), found.precession_min),
                         (map(np.max, nutations[1:]), found.precession_max)):
         assert np.abs(np.subtract([*peaks], peak)).max() < 0.05 * reach
-    assert len(nutations) >= 4 and len(line.y) <= POINTS + 2
+    assert len(nutations) >= 4 and len(line.y) <= POINTS + 2 and line.x[-1] == 17.3
     assert len(drawn.tip_path(track, t_ns)) == len(line.y) - 1
     first, = plots.motion_plots(track, 0, 0, t_ns)[-1].lines
     assert first.x[0] == 0.0 and len(first.y) <= POINTS + 2

@@ -27,7 +27,7 @@ from spinning_top_sim.tools.report import Mark
 # Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
 GAIN_OFF = 0.02         # of what should be 1: less than sensors differ in scale
-COMES_CLOSER = 0.99     # error of a bias that is still learned, over that a quarter of a rest before
+COMES_CLOSER = 0.99     # of the error of a bias a quarter of a rest before: it is learned still
 EXPLAINED = 0.25        # of an effect: what its cause may leave of it
 DELAY = 0.25            # samples: half of what a mean of two steps is late
 # Of shares that are 1 where a filter ignores gravity about an axis, or all but the force; right
