@@ -192,7 +192,7 @@ WRONG = {
     'bias clamped': (partial(Mahony, most=math.radians(0.1)), 'bias'),
     'bias negated': (partial(Part, report=np.negative), 'bias'),
     'bias in the world': (partial(IntegralInTheWorld, 0.5, 0.5, 0.05), 'bias'),
-    'covariance / 9': (partial(Part, ReferenceFilter, covariance=1.0 / 9.0), 'covariance'),
+    'covariance / 16': (partial(Part, ReferenceFilter, covariance=1.0 / 16.0), 'covariance'),
     'covariance x 50': (partial(Part, ReferenceFilter, covariance=50.0), 'covariance'),
     'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
 TABLE = {**{name: (make, '') for name, make in RIGHT.items()}, **WRONG}
