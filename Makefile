@@ -129,7 +129,7 @@ engines:
 
 #: make stress  random inputs, faults and kills, an hour; TIMES=100 tries ten times as many
 stress: dependencies
-	test/stress/all '$(VENV)' $(TIMES)
+	.ci/stress '$(VENV)' $(TIMES)
 
 #: make mutation
 #:              change the source in one place at a time, and list what no test

@@ -131,7 +131,7 @@ def assert_same(found, expected):
 
 
 @pytest.mark.parametrize('name', RUNS)
-@examples(6)
+@examples(4)
 @given(EVENTS, st.integers(0, 999))
 @example([(25 * MILLISECOND, act) for act in ACTS], 2)
 def test_any_division_of_a_run_gives_the_same_bytes(name, events, seed):

@@ -28,7 +28,7 @@ pytest.importorskip('vqf')
 
 NAMES = {'convention', 'gyroscope', 'accelerometer', 'magnetometer', 'timing', 'integration',
          'lever_arm', 'bias', 'covariance', 'accuracy', 'nondeterministic', 'invalid_output'}
-# The others take minutes: STRESS=100 pytest test/test_stress.py -k wrong
+# The others take minutes: STRESS=2 pytest test/test_stress.py -k filters
 FAST = [name for name, (make, _) in WRONG.items() if make.func is Part and make.args == ()]
 
 

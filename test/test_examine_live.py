@@ -107,7 +107,7 @@ def test_the_node_ends_with_the_exam():
         wait_for('the node to start', lambda: children(exam.pid))
         node = children(exam.pid)
         exam.send_signal(signal.SIGTERM)
-        _, said = exam.communicate(timeout=30.0)    # its end is that of the node, too
+        _, said = exam.communicate(timeout=120.0)    # its end is that of the node, too
         assert exam.returncode == 130 and 'interrupted' in said
         wait_for('the node to end', lambda: not any(os.path.exists(f'/proc/{one}')
                                                     for one in node))

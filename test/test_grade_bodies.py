@@ -13,7 +13,7 @@ from spinning_top_sim.grade.bodies import held
 @pytest.mark.parametrize('noisy', [False, True])
 @pytest.mark.parametrize('kind', ['free', 'forced'])
 def test_a_right_body_passes_and_its_lever_arm_is_found(kind, noisy):
-    for seed in range(4):
+    for seed in range(2):
         moving = body(seed, noisy=noisy, seconds=5.0, kind=kind)
         report = grade_readings(told(moving))
         assert report.passed, (seed, report)
@@ -25,17 +25,12 @@ def test_a_right_body_passes_and_its_lever_arm_is_found(kind, noisy):
 
 
 @pytest.mark.parametrize('fault', FAULTS)
-def test_a_fault_is_named_and_no_other_and_noise_of_the_poses_may_hide_it(fault):
-    for seed in range(2):
-        moving = body(seed, noisy=False, seconds=3.0, kind='forced', rate=200.0)
-        known = Imu(lever_arm=tuple(moving.arm) if seed % 2 or fault == 'no lever arm' else None)
+def test_a_fault_is_named_and_no_other(fault):
+    for noisy in (False, True):
+        moving = body(noisy, noisy=noisy, seconds=6.0, kind='forced', rate=200.0)
+        known = Imu(lever_arm=tuple(moving.arm) if noisy or fault == 'no lever arm' else None)
         report = grade_readings(told(moving, fault), known)
-        assert set(report.faults) == {NAMES[fault]}, (seed, report)
-    found = []
-    for seed in range(2):
-        moving = body(seed, noisy=True, seconds=10.0, kind='forced', rate=200.0)
-        found += grade_readings(told(moving, fault), Imu(lever_arm=tuple(moving.arm))).faults
-    assert {*found} == {NAMES[fault]}
+        assert report.faults == [NAMES[fault]], report
 
 
 def test_two_faults_are_told_as_both():

@@ -274,6 +274,8 @@ def test_a_log_is_played_over_dds_until_a_signal(peer, tmp_path):
                 'qos_overrides./names.publisher.depth:=30')) as node:
         node.name = '/replay'
         names = peer.listen('/names', String)
+        # Once it answers, it has discovered the subscription, too.
+        assert peer.switch(node, 'set_pause', True).success
         assert peer.switch(node, 'set_pause', False).success
         wait_for('all', lambda: len(names) >= 30)
         assert node.end() == 0 and 'Traceback' not in node.err

@@ -65,12 +65,6 @@ def test_each_error_alone_is_in_the_readings_of_its_sensor(name):
             name.startswith(sensor) for sensor in SENSORS]
 
 
-def test_of_the_sensor_only_the_rate_changes_between_resets():
-    """`Imu.at_period` keeps all other values."""
-    assert {name for name in parameters.AT_ONCE if name.startswith('imu.')} == {
-        'imu.enabled', 'imu.rate'}
-
-
 def read(values, times_ns, exact=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
     """Return what an IMU with a sample at each of these times reads, and its bias, (n, 6) each."""
     imu, shape = Imu(parameters.checked(values), times_ns.step), (3, len(times_ns))

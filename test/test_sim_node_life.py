@@ -85,7 +85,8 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
         assert f'{path}' in message and 'No space left' in message
         assert node.set(record__uri=f'{tmp_path}/third.mcap').successful
         assert node.switch('record', True).success
-        assert node.diagnostics()[:2] == (0, 'running')
+        level, _, said = node.diagnostics()         # 1 on a machine that cannot keep up
+        assert level < 2 and said['recorder'] == 'recording'
     errors = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
     assert ['not recording' in line for line in errors] == 3 * [True]
     assert precious.read_bytes() == b'precious' and verified(tmp_path / 'third.mcap')['identical']

@@ -58,12 +58,13 @@ def test_a_running_node(desk, peer, tmp_path):
         wait_for('the button', lambda: desk.inputs['Pause'].label == 'Resume')
         desk.press('Pause')
         wait_for('loops', lambda: motion() == 'loops')
-        # The trace begins with a reset.
+        # The trace begins with a reset, and then the top may be another one.
+        assert peer.set_together(node, top__mass=3.0).successful
         epoch_ns = view.track.epoch_ns
         desk.press('time', 'Reset')
         assert desk.message.content.startswith('reset: at t = 0')
-        wait_for('the stamp of t = 0',
-                 lambda: view.update(0.0) and view.track.epoch_ns != epoch_ns)
+        wait_for('the stamp of t = 0', lambda: (
+            view.update(0.0) and view.track.epoch_ns != epoch_ns and view.track.top.mass == 3.0))
         assert view.track.span[0] >= 0
         # Another topic, where the one that tells most has gone; a pose has no rates.
         for stream, topic in (('ground_truth_odom', 'joint_states'), ('joint_states', 'pose')):

@@ -1,33 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source distribution, and what is said where extras are missing; .ci/wheel installs it."""
+"""What is said where extras are missing; .ci/wheel tests the wheel and the source distribution."""
 
 import json
 import os
 import shutil
 import subprocess
 import sys
-import tarfile
 
 from helpers.reference import ROOT
 
 from spinning_top_sim.__main__ import COMMANDS, main
-
-INSTALLED = ('spinning_top_sim', 'config', 'foxglove', 'launch', 'resource', 'rviz', 'scripts',
-             'urdf')
-
-
-def test_the_source_distribution_has_every_file_that_is_installed(tmp_path):
-    settings = tmp_path / 'setup.cfg'
-    settings.write_text(f'[egg_info]\negg_base={tmp_path}\n')
-    code = f'import setuptools.build_meta as build; build.build_sdist({str(tmp_path)!r})'
-    subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True, timeout=120,
-                   env={**os.environ, 'DIST_EXTRA_CONFIG': str(settings)})
-    with tarfile.open(*tmp_path.glob('*.tar.gz')) as archive:
-        names = {name.partition('/')[2] for name in archive.getnames()}
-    ours = {str(path.relative_to(ROOT)) for folder in INSTALLED for path in
-            (ROOT / folder).rglob('*') if path.is_file() and path.suffix != '.pyc'}
-    assert {'spinning_top_sim/py.typed', 'config/imu/bmi088.yaml'} <= ours <= names
-
 
 # Commands, and the extra that they need.
 REMEDIES = [

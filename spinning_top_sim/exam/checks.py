@@ -27,6 +27,7 @@ from spinning_top_sim.tools.report import Mark
 # Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
 GAIN_OFF = 0.02         # of what should be 1: less than sensors differ in scale
+COMES_CLOSER = 0.99     # of the error of a bias a quarter of a rest before: it is learned still
 EXPLAINED = 0.25        # of an effect: what its cause may leave of it
 DELAY = 0.25            # samples: half of what a mean of two steps is late
 # Of shares that are 1 where a filter ignores gravity about an axis, or all but the force; right
@@ -206,7 +207,7 @@ def reported_bias(exam: Exam) -> Measured | None:
         for axis in axes:
             *_, before, last = (float(np.max(part)) for part in np.array_split(
                 np.abs(told[:, axis] / BIAS[axis] - 1.0), 4))
-            off.append(last if last > (1.0 - GAIN_OFF) * before else 0.0)
+            off.append(last if last > COMES_CLOSER * before else 0.0)
     # The turn between the rests changes the axes of the world, not those of the gyroscope.
     off += (np.abs(said[2] - said[1]) / np.abs(BIAS))[:2].tolist()
     ends = '; '.join(map(_in_degrees, said))

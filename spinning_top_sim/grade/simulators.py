@@ -273,6 +273,6 @@ class Judgement:
         yield from (Finding(fault.name, f'{text}; {fault.evidence}', fault.number)
                     for fault in causes)
         if not (first or causes):
-            wrong = '; it turns at other rates from the start on' * (
-                worst.of_start >= dynamics.EXPLAINED)
-            yield Finding('inaccurate', text + wrong, math.degrees(worst.worst))
+            if worst.of_start >= dynamics.EXPLAINED:
+                text += '; it turns at other rates from the start on'
+            yield Finding('inaccurate', text, math.degrees(worst.worst))

@@ -43,8 +43,7 @@ def circle(radius: float, theta: float) -> Lines:
 
 def tip_path(track: Track, t_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a time, from where the pivot is."""
-    begin_ns = t_ns - WINDOW_NS
-    _, states = track.states(t_ns, begin_ns, t_ns, track.step_ns(begin_ns, t_ns))
+    states = track.states(t_ns, t_ns - WINDOW_NS, t_ns)
     axis, place = np.stack(states.rows_axis, axis=1), states.pivot.position.T
     joined = np.linalg.norm(np.diff(axis, axis=0), axis=1) < LONGEST_CHORD
     return lines_through(axis_length(track) * axis + (place - place[-1]))[joined]

@@ -29,7 +29,11 @@ class LogSource:
                 raise LogError(f'{path}: {error}') from error
             self.track = SampledTrack(run.values_in_effect, run.epoch_ns)
             last_ns = _end_of_top(run)
-            self._read(reader, run, last_ns or 1 << 62)     # stamps that int64 can hold
+            for topic in [name for name in TOPICS if name in run.topics][:1]:
+                messages = [one.data for one in reader.messages(
+                    [run.topics[topic]], end=(last_ns or 1 << 62) + 1)]
+                length = len(self.track.templates[topic])       # a message of another is not ours
+                self.track.add_messages(topic, [one for one in messages if len(one) == length])
             notes = {'is damaged: what is whole is shown': not reader.whole,
                      'is shown up to the reset to another top': last_ns}
         if not len(self.track.rows):
@@ -42,16 +46,6 @@ class LogSource:
         self.page.message.content = ' '.join(
             f'*{path.name} {note}*' for note, is_so in notes.items() if is_so)
         self.player = Player(self.page, *self.track.span, changes_ns)
-
-    def _read(self, reader: LogReader, run: recorded_run.RunDescription, last_ns: int) -> None:
-        """Read the samples up to a log time [ns]."""
-        name = next((name for name in TOPICS if name in run.topics), '')
-        found = [message for message in reader.messages(
-            [run.topics[name]] if name else [], end=last_ns + 1)
-            if len(message.data) == len(self.track.templates[name])]       # else none of ours
-        if found:
-            self.track.add_messages(name, [one.data for one in found],
-                                    [one.log_time for one in found])
 
     def update(self, seconds: float) -> int:
         return self.player.advance(seconds)

@@ -57,7 +57,7 @@ class NodeView(Node):
         self._listener: Subscription | None = None
         self._track: SampledTrack | None = None
         self._epoch_ns = 0              # stamp of t = 0; 0 before /diagnostics tell it
-        self._is_stale = True           # whether the parameters have to be read
+        self._read_at: int | None = None        # this stamp when the parameters were read
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._paused = False
         self._stopped = threading.Event()
@@ -126,9 +126,7 @@ class NodeView(Node):
                 self._paused = numbers[STATE] == 'paused'
                 self._pause.label = 'Resume' if self._paused else 'Pause'
                 set_content(self._status, f'{status.message} · {SPEED} {numbers[SPEED]}')
-                epoch_ns = int(numbers[EPOCH])
-                if self._epoch_ns != epoch_ns:
-                    self._epoch_ns, self._is_stale = epoch_ns, True
+                self._epoch_ns = int(numbers[EPOCH])
 
     # The thread of the page.
 
@@ -137,8 +135,8 @@ class NodeView(Node):
                  and self._clients_of['get_parameters'].service_is_ready())
         if not ready or time.monotonic() > self._heard_at + ANSWER_S:
             set_content(self._status, f'**{self._name} has ended, or does not answer**')
-        if self._is_stale and ready:
-            self._read_parameters()
+        elif self._read_at != self._epoch_ns:
+            self._read_parameters(self._epoch_ns)
         track = self._track
         if track is None:
             return 0
@@ -166,21 +164,16 @@ class NodeView(Node):
                 track.drop_before(int(track.stamps_ns[-1]) + 1)     # the sim_node began again
             track.add_messages(topic, messages)
 
-    def _read_parameters(self) -> None:
-        """Read the parameters of the sim_node, and show its top."""
+    def _read_parameters(self, epoch_ns: int) -> None:
+        """Read the parameters of the sim_node since a stamp of t = 0, and show its top."""
         # Not those of the spin: the present one need not be possible at the start.
         names = [name for name in parameters.BY_NAME if name not in SPIN]
-        self._is_stale = False
         try:
             answer = self._call('get_parameters', GetParameters.Request(names=names))
-            track = SampledTrack(parameters.valid(dict(zip(
-                names, map(parameter_value_to_python, answer.values), strict=True))))
-        except ConnectionError:
-            self._is_stale = True
+        except ConnectionError:         # it is asked again with the next picture
             return
-        except ValueError:
-            self._is_stale = True
-            raise
+        track = SampledTrack(parameters.valid(dict(zip(
+            names, map(parameter_value_to_python, answer.values), strict=True))))
         if self._track is not None:
             track.stamps_ns, track.rows = self._track.stamps_ns, self._track.rows
-        self._track = track
+        self._track, self._read_at = track, epoch_ns

@@ -10,21 +10,20 @@ import numpy as np
 
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view.source import POINTS, Motion, Reals, Track, effective_potential
+from spinning_top_sim.view.source import Motion, Reals, Track, effective_potential
 
-BLUE, RED, GREEN, VIOLET = '#1c6dd0', '#d9482b', '#1e8a4c', '#7a52b3'
+BLUE, RED, GREEN = '#1c6dd0', '#d9482b', '#1e8a4c'
 FLAT = 1e-3                     # least range of an axis / the greatest value
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340, 172, 46, 332, 38, 140        # [px]
 
 
 class Line(NamedTuple):
-    """A line through points, or with `dots` the points alone; its name is in the legend."""
+    """A line through points; its name is in the legend."""
 
     name: str
     colour: str
     x: Reals
     y: Reals
-    dots: bool = False
 
 
 class Plot(NamedTuple):
@@ -51,12 +50,8 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
     t_ns : the time that is marked
     begin_ns, end_ns : span of the plots over the time; of a fast motion they show a part
     """
-    step_ns = track.step_ns(begin_ns, end_ns)
-    times, states = track.states(t_ns, begin_ns, end_ns, step_ns)
-    longest_ns, label = POINTS * step_ns, 'time t [s]'
-    if longest_ns < end_ns - begin_ns:
-        label += f', of this fast motion {longest_ns / NANOSECONDS:.2g} s at most'
-    seconds, (w1, w2, w3), top = times / NANOSECONDS, states.rows_angular_velocity, track.top
+    states, label = track.states(t_ns, begin_ns, end_ns), 'time t [s]'
+    seconds, (w1, w2, w3), top = states.t, states.rows_angular_velocity, track.top
     # Without the motion of the pivot.
     kinetic = 0.5 * (top.lambda1 * (w1 * w1 + w2 * w2) + top.lambda3 * w3 * w3) + 0.0 * seconds
     height = top.gravity_torque * states.rows_axis[2]
@@ -75,7 +70,7 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
 
 
 def _potential(body: Top, motion: Motion | None) -> list[Line]:
-    """Return V around the bounds of theta, the energy of the axis, and the turning points."""
+    """Return V around the bounds of theta, and the energy of the axis between them."""
     if motion is None or motion.description is None:
         return []
     l3, lz = motion.l3, motion.lz
@@ -86,14 +81,8 @@ def _potential(body: Top, motion: Motion | None) -> list[Line]:
     shown = np.flatnonzero(values <= motion.energy + depth)
     theta = np.linspace(theta[shown[0]], theta[shown[-1]], 200)
     bounds = np.array([motion.description.theta_min, motion.description.theta_max])
-    with np.errstate(all='ignore'):         # at the poles V may be infinite
-        heights = effective_potential(body, l3, lz, bounds)
-    turning = bounds[np.abs(heights - motion.energy) < 1e-3 * depth]
-    inside = np.degrees(np.clip(bounds, theta[0], theta[-1]))
     return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta)),
-            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy)),
-            Line('turning points', VIOLET, np.degrees(turning),
-                 np.full(len(turning), motion.energy), dots=True)]
+            Line('E − L₃²/2λ₃', GREEN, np.degrees(bounds), np.full(2, motion.energy))]
 
 
 class _Axis:
@@ -154,9 +143,7 @@ def draw(plot: Plot) -> str:
     for line in lines:
         places = np.column_stack((across.place(line.x), up.place(line.y)))[np.isfinite(line.y)]
         points = ' '.join(f'{x},{y}' for x, y in places.tolist())
-        drawn += [f'<circle cx="{x}" cy="{y}" r="4" fill="{line.colour}"/>'
-                  for x, y in places.tolist()] if line.dots else [
-            f'<polyline stroke="{line.colour}" points="{points}"/>']
+        drawn.append(f'<polyline stroke="{line.colour}" points="{points}"/>')
     if math.isfinite(plot.now):
         dot = '' if math.isnan(plot.point) else f'<circle cy="{up.place(plot.point)}" r="5"/>'
         drawn.append(f'<g class="now" transform="translate({across.place(plot.now)} 0)">'

@@ -63,16 +63,10 @@ class SampledTrack(Track):
                                           return_index=True)
         self.rows = np.concatenate((self.rows, rows))[order]
 
-    def add_messages(self, topic: str, messages: Sequence[bytes],
-                     stamps_ns: Sequence[int] | None = None) -> None:
-        """
-        Add serialized messages of one of TOPICS; by default with the stamps in them.
-
-        Those whose quaternion is no attitude are left out.
-        """
+    def add_messages(self, topic: str, messages: Sequence[bytes]) -> None:
+        """Add messages of one of TOPICS, but those whose quaternion is no attitude."""
         template, data = self.templates[topic], b''.join(messages)
-        stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
-        fields = template.decode(data)
+        stamps, fields = template.stamps_ns(data), template.decode(data)
         known_ns, samples = attitudes_of(topic, self._imu, stamps, fields)
         place = np.full((len(known_ns), 3), np.nan)
         if topic in ('pose', 'ground_truth/odom'):

@@ -104,8 +104,8 @@ class Track(ABC):
         """Return the state (n = 1) at the time of a sample."""
         return self.at(np.array([t_ns]))
 
-    def step_ns(self, begin_ns: int, end_ns: int) -> int:
-        """Return the greatest step between samples in a span that shows its motions [ns]."""
+    def states(self, t_ns: int, begin_ns: int, end_ns: int) -> States:
+        """Return samples of a span; of a motion too fast for POINTS, in a part around a time."""
         longest_ns, top = max(1, (end_ns - begin_ns) // FEWEST), self.top
         states = self.at(self.times(begin_ns, end_ns, 10 * longest_ns))
         # At most so fast are a nutation, and the axis with its energy.
@@ -118,13 +118,9 @@ class Track(ABC):
         if found and found.nutation_period:
             most = math.tau / found.nutation_period * POINTS / (PER_TURN * NUTATIONS)
             rate = max(rate, min(most, max(found.precession_max, -found.precession_min)))
-        return max(1, min(longest_ns, int(math.tau / (PER_TURN * rate) * NANOSECONDS)))
-
-    def states(self, t_ns: int, begin_ns: int, end_ns: int, step_ns: int) -> tuple[Times, States]:
-        """Return samples with a step; if POINTS do not span it, of a part around a time."""
+        step_ns = max(1, min(longest_ns, int(math.tau / (PER_TURN * rate) * NANOSECONDS)))
         end_ns = min(end_ns, max(t_ns, begin_ns + POINTS * step_ns))
-        times = self.times(max(begin_ns, end_ns - POINTS * step_ns), end_ns, step_ns)
-        return times, self.at(times)
+        return self.at(self.times(max(begin_ns, end_ns - POINTS * step_ns), end_ns, step_ns))
 
     def motion_at(self, t_ns: int) -> Motion | None:
         """Return the motion at a time, by the newest sample; None if its rates are not known."""

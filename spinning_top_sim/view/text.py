@@ -9,7 +9,7 @@ from spinning_top_sim.installation import read_table
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.times import NANOSECONDS, stamp_text
-from spinning_top_sim.view.source import POINTS, WINDOW_NS, Motion, Track
+from spinning_top_sim.view.source import Motion, Track
 
 NO_SAMPLES = 'no samples yet'
 BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
@@ -35,20 +35,13 @@ def words(track: Track, t_ns: int) -> str:
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
                        ('attitude', ''))
-    longest_ns = POINTS * track.step_ns(t_ns - WINDOW_NS, t_ns)
-    trace = '' if longest_ns >= WINDOW_NS else (
-        f'The motion is fast: its trace shows the last {number(longest_ns / NANOSECONDS)} s.')
-    rows = [*_rows(track.top, motion)] if motion else []
-    place = track.state(sample_ns).pivot.position[:, 0]
-    if place.any():
-        rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
         f'<div class="top-words" data-from="{t_ns / NANOSECONDS}">',
         f'<h1>{title}</h1>',
-        *(f'<p>{html.escape(line)}</p>' for line in (sentence, track.about, trace) if line),
+        *(f'<p>{html.escape(line)}</p>' for line in (sentence, track.about) if line),
         '<table>',
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
-          for label, value, note in rows),
+          for label, value, note in (_rows(track.top, motion) if motion else ())),
         f'</table><p class="stamp" data-epoch="{track.epoch_ns}">t = '
         f'{sample_ns / NANOSECONDS:.3f} s, stamp {stamp_text(track.epoch_ns + sample_ns)}</p>',
         '</div>'))

@@ -64,11 +64,13 @@ def free(t, random, rate):
     w0 = random.standard_normal(3)
     w0 *= rate / np.linalg.norm(w0)
 
+    ratios = (np.roll(inertia, -1) - np.roll(inertia, -2)) / inertia
+
     def slope(_, y):
-        w, q = y[:3], y[3:]
-        return np.concatenate((np.cross(inertia * w, w) / inertia, 0.5 * np.array((
-            q[3] * w[0] + q[1] * w[2] - q[2] * w[1], q[3] * w[1] + q[2] * w[0] - q[0] * w[2],
-            q[3] * w[2] + q[0] * w[1] - q[1] * w[0], -q[:3] @ w))))
+        a, b, c, x, y, z, w = y.tolist()
+        return (*(ratios * (b * c, c * a, a * b)), 0.5 * (w * a + y * c - z * b),
+                0.5 * (w * b + z * a - x * c), 0.5 * (w * c + x * b - y * a),
+                -0.5 * (x * a + y * b + z * c))
 
     q0 = Rotation.random(random_state=int(random.integers(1 << 30))).as_quat()
     y = solve_ivp(slope, (t[0], t[-1] + 1e-9), [*w0, *q0], 'DOP853', t, rtol=1e-12,

@@ -17,6 +17,11 @@ def exact(top, start, times, dt, **options):
     return motion.quaternion, motion.angular_velocity, motion.angular_acceleration
 
 
+def cross(one, other):
+    (a, b, c), (x, y, z) = one, other
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
+
+
 def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, world=False,
           damping=0.0, turn=1.0):
     """Return the same by Euler's equations, of which something may differ from the top's."""
@@ -24,15 +29,16 @@ def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, worl
     com = np.array(top.com if com is None else com)
 
     def accelerations(q, w):
-        """Return those of states (4, n), (3, n)."""
-        rotation, rates = Rotation.from_quat(q.T), w.T
-        term = np.cross(rates, rates * inertia)
+        """Return those of states (4, n), (3, n), or of one; np.cross takes long for one."""
+        x, y, z, s = q
+        up = 2.0 * np.array((x * z - s * y, y * z + s * x, 0.5 - x * x - y * y))
+        term = cross(w, (w.T * inertia).T)
         if world:
-            rates = rotation.apply(rates)
-            term = inertia * rotation.inv().apply(np.cross(rates, rates * inertia) / inertia)
-        up = rotation.inv().apply((0.0, 0.0, 1.0))
-        torque = -top.mass * top.gravity * np.cross(com, up) - gyroscopic * term
-        return (torque / inertia - damping * w.T).T
+            rotation = Rotation.from_quat(q.T)
+            rates = rotation.apply(w.T)
+            term = (rotation.inv().apply(np.cross(rates, rates * inertia) / inertia) * inertia).T
+        torque = -top.mass * top.gravity * cross(com, up) - gyroscopic * term
+        return (torque.T / inertia - damping * w.T).T
 
     def slope(t, y):
         q, w = y[:4], y[4:]
@@ -40,7 +46,7 @@ def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, worl
         return np.concatenate((
             [q[3] * x + q[1] * z - q[2] * y, q[3] * y + q[2] * x - q[0] * z,
              q[3] * z + q[0] * y - q[1] * x, -q[0] * x - q[1] * y - q[2] * z],
-            accelerations(q[:, np.newaxis], w[:, np.newaxis])[:, 0]))
+            accelerations(q, w)))
 
     y = solve_ivp(slope, (0.0, times[-1]), [*start.attitude, *start.rates], 'DOP853', times,
                   rtol=1e-10, atol=1e-12).y

@@ -69,7 +69,7 @@ def _change(data: bytearray, places: list[tuple[int, int]], rng: random.Random) 
     """Change a record of a file or of a chunk, seldom the whole: bits, numbers, bytes, places."""
     begin, end = rng.choice(places) if places and rng.random() < 0.95 else (0, len(data))
     at = rng.randrange(begin, end + 1)
-    kind = rng.choice(('bit', 'number', 'number', 'overwrite', 'remove', 'copy'))
+    kind = rng.choice(('bit', 'number', 'number', 'remove', 'copy'))
     if kind == 'bit' and at < end:
         data[at] ^= 1 << rng.randrange(8)
     elif kind == 'number':      # opcodes, lengths, counts, stamps, ids are all in the first fields
@@ -77,9 +77,6 @@ def _change(data: bytearray, places: list[tuple[int, int]], rng: random.Random) 
         number = rng.choice((*NUMBERS, end - begin - 8, len(data), rng.randrange(len(data) + 1)))
         if at + size <= end:
             data[at:at + size] = (number & (1 << 8 * size) - 1).to_bytes(size, 'little')
-    elif kind == 'overwrite':
-        size = rng.choice((1, 2, 4, 8, 64))
-        data[at:at + size] = rng.choice((rng.randbytes(size), bytes(size), b'\xff' * size))
     elif kind == 'remove':
         del data[begin if rng.random() < 0.5 else at:end]
     elif kind == 'copy':

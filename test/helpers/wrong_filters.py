@@ -82,14 +82,16 @@ class Mahony:
     def _turn(self, a, m, dt):
         up, north, learns = self._gains
         r = reference.matrix_of(self._q)
-        e = up * np.cross(a, r[2]) / np.linalg.norm(a) * self._feels
+        (x, y, z), (i, j, k) = a.tolist(), r[2].tolist()        # np.cross takes 50 times as long
+        e = up / math.hypot(x, y, z) * np.array((
+            y * k - z * j, z * i - x * k, x * j - y * i)) * self._feels
         if m is not None:
             h = r @ m
             if not self._level:
                 yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
                 h = Rotation.from_euler('z', yaw).apply(m)
             e = e + north * math.atan2(h[0], h[1]) * r[2]
-        self.bias = np.clip(self.bias - learns * e * dt, -self._most, self._most)
+        self.bias = (self.bias - learns * dt * e).clip(-self._most, self._most)
         return e * dt
 
     def update(self, w, a, m, dt):
@@ -102,7 +104,7 @@ class Mahony:
             self._q = self._advance(self._q, (w - self.bias) * dt)
             self._q = body(self._q, self._turn(a, m, dt))
         self._q = self._q.astype(self._number).astype(float)
-        self._q /= np.linalg.norm(self._q)
+        self._q /= math.sqrt(self._q @ self._q)
         return self._q.copy()
 
 
@@ -190,7 +192,7 @@ WRONG = {
     'bias clamped': (partial(Mahony, most=math.radians(0.1)), 'bias'),
     'bias negated': (partial(Part, report=np.negative), 'bias'),
     'bias in the world': (partial(IntegralInTheWorld, 0.5, 0.5, 0.05), 'bias'),
-    'covariance / 9': (partial(Part, ReferenceFilter, covariance=1.0 / 9.0), 'covariance'),
+    'covariance / 16': (partial(Part, ReferenceFilter, covariance=1.0 / 16.0), 'covariance'),
     'covariance x 50': (partial(Part, ReferenceFilter, covariance=50.0), 'covariance'),
     'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
 TABLE = {**{name: (make, '') for name, make in RIGHT.items()}, **WRONG}
