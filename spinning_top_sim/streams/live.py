@@ -3,20 +3,21 @@
 A simulation that sends its messages in time.
 
 Messages up to `sent_ns` are sent.  The channels of one grid are computed together, a short time
-ahead, and wait as rows.  An event, another rate or another listener drops what waits.
+ahead.  They wait as rows for the log, and one by one, in order, for subscribers.  An event,
+another rate or another listener drops what waits.
 """
 
 import contextlib
 import time
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.channel import Channel, Rows
@@ -39,7 +40,8 @@ class Output:
     """
     Where the messages of a channel go.
 
-    publish : takes each message in time, and may raise; None while there are no subscribers
+    publish : takes each message in time, and may raise; None while there are no subscribers.
+        `LiveSimulation.refresh` follows a change
     log_index : number of the topic in the log, None if it is not recorded
     clock : returns steady time [s]
     sent, skipped, failed : messages that were published, that were too late for that, and that
@@ -53,7 +55,7 @@ class Output:
     sent: int = 0
     skipped: int = 0
     failed: int = 0
-    # Log times [ns], as an array and as a list, and messages; so many of them are sent.
+    # What waits for the log: log times [ns], as array and list, and rows; so many are sent.
     _log_times: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
@@ -66,18 +68,18 @@ class Output:
         return self.publish is not None or self.log_index is not None
 
     def add(self, log_times: Times, rows: Rows) -> None:
-        """Put messages behind those that wait."""
+        """Put messages behind those that wait for the log."""
         if self._taken < len(self._times):
             log_times = np.concatenate((self._log_times[self._taken:], log_times))
             rows = np.concatenate((self._rows[self._taken:], rows))
         self._log_times, self._times, self._rows = log_times, log_times.tolist(), rows
         self._taken = 0
 
-    def take(self, until_ns: int) -> tuple[Times, list[int], Rows]:
-        """Return what waits up to a log time [ns], which waits no longer."""
+    def take(self, until_ns: int) -> tuple[Times, Rows]:
+        """Return what waits for the log up to a log time [ns], and waits no longer."""
         begin, end = self._taken, bisect_right(self._times, until_ns, self._taken)
         self._taken = end
-        return self._log_times[begin:end], self._times[begin:end], self._rows[begin:end]
+        return self._log_times[begin:end], self._rows[begin:end]
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -141,19 +143,16 @@ class LiveSimulation(Simulation):
 
     def refresh(self) -> None:
         """Compute anew what waits: the motion, or who takes the messages, has changed."""
-        # Those that are used, with their numbers.
-        self._used = [one for one in enumerate(self.outputs) if one[1].is_used]
+        # For subscribers: log times [ns], numbers of outputs, messages.
+        self._waiting: deque[tuple[int, int, bytes]] = deque()
         outputs_of: dict[tuple[int, int], dict[Channel, Output]] = {}
-        for _, output in self._used:
+        for output in self.outputs:
             output.take(NEVER_NS)
-            outputs_of.setdefault(output.channel.grid, {})[output.channel] = output
+            if output.is_used:
+                outputs_of.setdefault(output.channel.grid, {})[output.channel] = output
         self._grids = [_Progress(self.sent_ns, FIRST_SPAN_NS, outputs)
-                       for outputs in outputs_of.values()]
-
-    @property
-    def _ready_ns(self) -> int:
-        """Time up to which all messages are sent or wait [ns]."""
-        return min(one.computed_ns for one in self._grids or [self._motion])
+                       for outputs in outputs_of.values()] or [self._motion]
+        self._ready_ns = self.sent_ns       # up to here all messages are sent or wait
 
     def send(self, due_ns: int, publish_from_ns: int = 0,
              give_way: Callable[[], bool] = lambda: False) -> bool:
@@ -177,7 +176,7 @@ class LiveSimulation(Simulation):
 
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """Compute some of what is due up to a time, for one grid; it may take so long."""
-        if self._grids and self._ready_ns < until_ns:
+        if self._ready_ns < until_ns:
             behind = min(self._grids, key=attrgetter('computed_ns'))
             span_ns = min(behind.span_ns, LONGEST_SPAN_NS)
             with contextlib.suppress(IntegrationError):     # `send` meets it in time
@@ -192,6 +191,7 @@ class LiveSimulation(Simulation):
                 raise
         for grid in grids:
             self._compute(grid, min(goal_ns, self._motion.computed_ns), seconds)
+        self._ready_ns = min(grid.computed_ns for grid in self._grids)
         self.forget()
 
     def _compute(self, part: _Progress, until_ns: int, seconds: float) -> None:
@@ -202,28 +202,38 @@ class LiveSimulation(Simulation):
             if part is self._motion:
                 goal_ns = self.reach(part.computed_ns, goal_ns)
             for channel, t_ns, rows in self.messages(part.outputs, part.computed_ns, goal_ns):
-                part.outputs[channel].add(self.epoch_ns + t_ns, rows)
+                self._add(part.outputs[channel], self.epoch_ns + t_ns, rows)
             done_ns, called = goal_ns - part.computed_ns, now
             part.computed_ns, now = goal_ns, self._clock()
             # Where it took too long, the next piece is a half of it, else up to twice as long.
             part.span_ns = (max(1, done_ns // 2) if now - called > 0.5 * seconds
                             else max(part.span_ns, 2 * done_ns))
 
+    def _add(self, output: Output, log_times: Times, rows: Rows) -> None:
+        """Let messages of an output wait."""
+        if output.log_index is not None:
+            output.add(log_times, rows)
+        if output.publish is not None:
+            messages = rows.view(f'V{rows.shape[1]}')[:, 0].tolist()    # bytes, all at once
+            self._waiting = deque(sorted([*self._waiting, *zip(
+                log_times.tolist(), repeat(self.outputs.index(output)), messages)]))
+
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
+        end_ns, late_ns = self.epoch_ns + until_ns, self.epoch_ns + publish_from_ns
         logged: list[LogRows] = []
-        due: list[tuple[int, int, NDArray[np.uint8]]] = []
-        for number, output in self._used:
-            log_times, times, rows = output.take(self.epoch_ns + until_ns)
-            if times and output.log_index is not None:
-                logged.append((output.log_index, log_times, rows))
-            if output.publish is not None:
-                late = bisect_left(times, self.epoch_ns + publish_from_ns)
-                output.skipped += late
-                due += zip(times[late:], repeat(number), rows[late:])
+        for output in self.outputs:
+            if output.log_index is not None:
+                log_times, rows = output.take(end_ns)
+                if len(rows):
+                    logged.append((output.log_index, log_times, rows))
         if logged:
             self._write(logged)
         self.sent_ns = until_ns
-        due.sort(key=itemgetter(0, 1))
-        for _, number, row in due:
-            self.outputs[number].send(row.tobytes())
+        waiting = self._waiting
+        while waiting and waiting[0][0] <= end_ns:
+            log_time, number, message = waiting.popleft()
+            if log_time < late_ns:
+                self.outputs[number].skipped += 1
+            else:
+                self.outputs[number].send(message)
