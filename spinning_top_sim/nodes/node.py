@@ -70,7 +70,8 @@ class Simulator(Node):
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
             error=log.error, update_subscribers=self._topics.update_subscribers)
-        self._alarms: dict[str, Timer] = {}
+        self._timer_of: dict[str, Timer] = {}       # by what it does
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._topics.open(values)
         self._diagnostics = publishers.create_publisher(
             self, DiagnosticArray, '/diagnostics')
@@ -113,33 +114,23 @@ class Simulator(Node):
             self._every('tick', period_ns / NANOSECONDS, self._tick)
             self._tick()
 
-        self._once('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
+        self._every('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
 
     def _tick(self) -> None:
-        self.loop.tick()
+        state = self.loop.tick()
         if reason := self._recording.check():
             self._log.error(f'not recording: {reason}; the simulation goes on')
-        state = self.loop.state
         if state is LoopState.WAITING:
             self._begin()
-        elif state is LoopState.ENDED and 'end' not in self._alarms:
+        elif state is LoopState.ENDED:
             publishers.wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self._once('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
+            self._every('tick', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
 
     def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
         """Call back in steady time, each `period` [s], instead of what this timer did before."""
-        if name in self._alarms:
-            self.destroy_timer(self._alarms[name])
-        self._alarms[name] = self.create_timer(
-            period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _once(self, name: str, delay: float, callback: Callable[[], object]) -> None:
-        """Call back once, after a delay [s], instead of what this timer did before."""
-        def act() -> None:
-            self._alarms[name].cancel()
-            callback()
-
-        self._every(name, delay, act)
+        if name in self._timer_of:
+            self.destroy_timer(self._timer_of[name])
+        self._timer_of[name] = self.create_timer(period, callback, clock=self._steady)
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
