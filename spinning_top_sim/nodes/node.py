@@ -109,12 +109,9 @@ class Simulator(Node):
     def _align_ticks(self) -> None:
         """Let ticks come just after samples are due."""
         period_ns = self.loop.tick_period_ns
-
-        def first() -> None:
-            self._every('tick', period_ns / NANOSECONDS, self._tick)
-            self._tick()
-
-        self._every('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
+        time.sleep(self.clock.until_grid(period_ns) / NANOSECONDS)
+        self._every('tick', period_ns / NANOSECONDS, self._tick)
+        self._tick()
 
     def _tick(self) -> None:
         state = self.loop.tick()
@@ -170,8 +167,10 @@ class Simulator(Node):
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if changes.items() <= self._spin().items():     # nothing changes
             return SetParametersResult(successful=True)
-        command, others = ros_parameters.commanded(changes)
-        error, reason = self.outcome(lambda: self._change(command, others))
+        # A spin beside `initial.*` is that of the next start; alone it is a command.
+        command = {} if any(name.startswith('initial.') for name in changes) else {
+            name: changes.pop(name) for name in SPIN if name in changes}
+        error, reason = self.outcome(lambda: self._change(command, changes))
         if error is not None and command:
             self.loop.rejected_commands += 1
         return SetParametersResult(successful=error is None, reason=reason)
@@ -193,11 +192,12 @@ class Simulator(Node):
         except Exception:
             self._topics.open(self.values_next)
             raise
-        if others:          # a spin among them is that of the next start
+        if others:
             self.loop.set_parameters(values, {name: values[name] for name in sorted(
                 others.keys() - SPIN)})
-            self._align_ticks()
         self.values_next = values
+        if others:
+            self._align_ticks()
 
     def _command(self, given: Mapping[str, Any]) -> None:
         command = parameters.checked_changes(given)

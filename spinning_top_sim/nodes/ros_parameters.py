@@ -91,10 +91,3 @@ def _with_type(name: str, value: Any) -> Any:
     with contextlib.suppress(KeyError, ValueError):
         value = parameters.BY_NAME[name].check(value)
     return list(value) if isinstance(value, tuple) else value
-
-
-def commanded(changes: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the spin that changes command, none beside `initial.*`, and the other changes."""
-    command = {} if any(name.startswith('initial.') for name in changes) else {
-        name: changes[name] for name in SPIN if name in changes}
-    return command, {name: value for name, value in changes.items() if name not in command}
