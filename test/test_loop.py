@@ -116,14 +116,6 @@ def test_a_pause_holds_a_step_is_exact_and_nothing_is_caught_up(monkeypatch):
     assert run.loop.late_ticks == run.loop.skipped_ticks == 0
 
 
-def test_a_change_of_parameters_does_not_hide_a_jump_of_the_clock():
-    run = Run(follows=True).ticks(4)
-    run.now_ns += 3600 * SECOND
-    run.loop.set_parameters(run.values, {'status_period': 0.5})
-    run.ticks(2)
-    assert run.kinds == ['epoch', 'parameters'] and run.simulation.now_ns == 6 * TICK_NS
-
-
 def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahead_slips(
         monkeypatch):
     """By a second of real time."""
