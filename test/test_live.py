@@ -110,30 +110,13 @@ def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monke
 
 
 def test_after_a_change_of_the_rates_every_topic_goes_on_on_the_new_grid():
-    simulation, rates = simulate(), [name for name in parameters.BY_NAME if name.endswith('.rate')
-                                     and not name.startswith('imu.vibration')]
-    before, after, changed_at, until_ns = 1000.0, 33.0, 123_456_789, SECOND // 4
-    simulation.apply('parameters', **dict.fromkeys(rates, before))
+    changed_at, until_ns, rates = 123_456_789, SECOND // 4, [
+        name for name in parameters.BY_NAME if name.endswith('.rate') and 'vibration' not in name]
+    simulation = simulate(dict.fromkeys(rates, 1000.0))
     taken = record(simulation)
     simulation.send(changed_at)
-    simulation.apply('parameters', **dict.fromkeys(rates, after), tick_rate=100.0)
+    simulation.apply('parameters', **dict.fromkeys(rates, 33.0))
     simulation.send(until_ns)
-    old, new = round(SECOND / before), round(SECOND / after)
     for one in simulation.channels:
-        assert times(taken, one.topic) == [
-            *range(0, changed_at + 1, old),
-            *(t for t in range(0, until_ns + 1, new) if t > changed_at)], one.topic
-
-
-def test_motions_are_forgotten_when_nothing_reaches_back_to_them():
-    """The trace of the markers has 4 s by default."""
-    simulation = simulate()
-    record(simulation, 'markers')
-    for tick in range(1, 61):
-        simulation.send(tick * SECOND // 10)
-        simulation.apply('command', l3=1.6 + 0.001 * tick, lz=1.4)
-    kept = simulation.trajectory.starts(0, 7 * SECOND)
-    assert 3 * SECOND // 2 <= kept[0] <= 2 * SECOND
-    assert kept == list(range(kept[0], 6 * SECOND + 1, SECOND // 10))
-    with pytest.raises(LookupError, match=r't = 0 ns: the motion before .* is forgotten'):
-        simulation.trajectory.evaluate(np.array([0]))
+        assert times(taken, one.topic) == [*range(0, changed_at + 1, MILLISECOND), *(
+            t for t in range(0, until_ns + 1, round(SECOND / 33)) if t > changed_at)], one.topic
