@@ -130,11 +130,7 @@ class Loop:
         self.paused = True
 
     def resume(self) -> None:
-        """
-        Let simulated time run on from where it was held, without catching up.
-
-        Raises RuntimeError if the motion has failed; a pause remains then.
-        """
+        """Let simulated time run on, without catching up, or raise RuntimeError in FAILED."""
         self._check_motion()
         if self.paused:
             self.paused = False

@@ -39,12 +39,10 @@ LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
 
 class Simulator(Node):
     """
-    The node.
+    The node.  Raises ValueError for a parameter that is not allowed.
 
     given : parameters of its command line, which those of ROS override
     values_next : what the next reset begins with; an unset spin.lz follows initial.theta
-
-    Raises ValueError for a parameter that is not allowed.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:
@@ -207,11 +205,7 @@ class Simulator(Node):
             for name, present in self._spin().items()})
 
     def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
-        """
-        Return the error of an action, and its text.
-
-        An error other than ValueError, RuntimeError and OSError is unexpected, and raised.
-        """
+        """Return the error of an action, and its text; raise one that is unexpected."""
         try:
             return None, act() or ''
         except (ValueError, RuntimeError, OSError) as error:
@@ -248,12 +242,7 @@ class Simulator(Node):
         return f'at t = 0, stamps go on from {self.simulation.epoch_ns} ns'
 
     def start_again(self, paused: bool | None = None) -> None:
-        """
-        Reset the motion, and pause it or not; None keeps the present state.
-
-        Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
-        motion begins with the present parameters; nothing changes then.
-        """
+        """Reset the motion, as `Loop.reset` does."""
         self.loop.reset(self.values_next, paused)
         self._align_ticks()
         self.show_spin()
@@ -294,11 +283,7 @@ class Simulator(Node):
 
 
 def answers_later(service: Service) -> None:
-    """
-    Let the callback of a service return a Future of the response, which is sent when that is done.
-
-    rclpy's EventsExecutor has no coroutines for services.
-    """
+    """Let a callback return a Future of the response: EventsExecutor has no coroutines here."""
     send = service.send_response
 
     def send_when_done(future: Future, header: object) -> None:

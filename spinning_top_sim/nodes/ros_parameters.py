@@ -17,12 +17,8 @@ SPIN = ('spin.l3', 'spin.lz')
 
 
 def take_overrides(node: Node) -> dict[str, Any]:
-    """
-    Return the parameters that a node was started with, which can then be declared.
-
-    The node must have been made with `automatically_declare_parameters_from_overrides`, the public
-    way to learn of them.  Raises ValueError for a use_sim_time that is no bool.
-    """
+    """Return the parameters that a node was started with; these can then be declared."""
+    # It was made with `automatically_declare_parameters_from_overrides`.
     found = {name: node.get_parameter(name).value for name in node.get_parameters_by_prefix('')}
     if not isinstance(found['use_sim_time'], bool):
         raise ValueError(f'use_sim_time = {found["use_sim_time"]!r}: must be true or false')

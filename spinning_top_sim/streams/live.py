@@ -2,9 +2,8 @@
 """
 A simulation that sends its messages in time.
 
-Messages up to `sent_ns` are sent.  The channels of one grid are computed together, a short time
-ahead.  They wait as rows for the log, and one by one, in order, for subscribers.  An event,
-another rate or another listener drops what waits.
+The channels of one grid are computed together, a short time ahead.  What is computed waits, as
+rows for the log, in one queue for subscribers.  An event, another rate or listener drops it.
 """
 
 import contextlib
@@ -40,8 +39,7 @@ class Output:
     """
     Where the messages of a channel go.
 
-    publish : takes each message in time, and may raise; None while there are no subscribers.
-        `LiveSimulation.refresh` follows a change
+    publish : takes each message in time, and may raise; None while there are no subscribers
     log_index : number of the topic in the log, None if it is not recorded
     clock : returns steady time [s]
     sent, skipped, failed : messages that were published, that were too late for that, and that
@@ -55,7 +53,7 @@ class Output:
     sent: int = 0
     skipped: int = 0
     failed: int = 0
-    # What waits for the log: log times [ns], as array and list, and rows; so many are sent.
+    # For the log: log times [ns], as array and list, and rows; so many are sent, others wait.
     _log_times: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
@@ -77,9 +75,8 @@ class Output:
 
     def take(self, until_ns: int) -> tuple[Times, Rows]:
         """Return what waits for the log up to a log time [ns], and waits no longer."""
-        begin, end = self._taken, bisect_right(self._times, until_ns, self._taken)
-        self._taken = end
-        return self._log_times[begin:end], self._rows[begin:end]
+        begin, self._taken = self._taken, bisect_right(self._times, until_ns, self._taken)
+        return self._log_times[begin:self._taken], self._rows[begin:self._taken]
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -125,9 +122,9 @@ class LiveSimulation(Simulation):
                channels: Sequence[Channel] = ()) -> None:
         """Record these channels, numbered in this order, and no others after `sent_ns`."""
         self._write = write or self._write
+        numbers = {channel: number for number, channel in enumerate(channels)}
         for output in self.outputs:
-            output.log_index = (channels.index(output.channel) if output.channel in channels
-                                else None)
+            output.log_index = numbers.get(output.channel)
         self.refresh()
 
     def apply(self, kind: str, **details: Any) -> Event:
