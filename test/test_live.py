@@ -134,3 +134,13 @@ def test_after_a_change_of_the_rates_every_topic_goes_on_on_the_new_grid():
     for one in simulation.channels:
         assert times(taken, one.topic) == [*range(0, changed_at + 1, MILLISECOND), *(
             t for t in range(0, until_ns + 1, round(SECOND / 33)) if t > changed_at)], one.topic
+
+
+def test_motions_are_forgotten_when_nothing_reaches_back_to_them():
+    """The trace of the markers has 4 s by default."""
+    simulation = simulate()
+    for tick in range(1, 61):
+        simulation.send(tick * SECOND // 10)
+        simulation.apply('command', l3=1.6 + 0.001 * tick, lz=1.4)
+    kept = simulation.trajectory.starts(0, 7 * SECOND)
+    assert 3 * SECOND // 2 <= kept[0] <= 2 * SECOND and kept[-1] == 6 * SECOND

@@ -18,12 +18,11 @@ class Run:
     """
     A loop that has started, on a steady clock that goes on by `step_ns` whenever it is read.
 
-    follows: a /clock, which shows the same time
     times: of the poses recorded since the start or the last reset
     told: warnings, errors and events
     """
 
-    def __init__(self, follows=False, **values):
+    def __init__(self, **values):
         self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
         self.counted = 0            # how often subscribers were
         self.simulation = simulate(**values)
@@ -32,8 +31,7 @@ class Run:
                                     write=self.told.append)
         self.loop = Loop(
             self.simulation, self.values, recording, SimulatedClock(
-                lambda: DATE_NS + self.now_ns - 77, self.told.append, follows=follows,
-                steady=self.read),
+                lambda: DATE_NS + self.now_ns - 77, self.told.append, steady=self.read),
             update_subscribers=self.count, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
