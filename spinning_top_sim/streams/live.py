@@ -188,6 +188,7 @@ class LiveSimulation(Simulation):
                 raise
         for grid in grids:
             self._compute(grid, min(goal_ns, self._motion.computed_ns), seconds)
+        self._waiting = deque(sorted(self._waiting))
         self._ready_ns = min(grid.computed_ns for grid in self._grids)
         self.forget()
 
@@ -212,8 +213,8 @@ class LiveSimulation(Simulation):
             output.add(log_times, rows)
         if output.publish is not None:
             messages = rows.view(f'V{rows.shape[1]}')[:, 0].tolist()    # bytes, all at once
-            self._waiting = deque(sorted([*self._waiting, *zip(
-                log_times.tolist(), repeat(self.outputs.index(output)), messages)]))
+            self._waiting.extend(zip(
+                log_times.tolist(), repeat(self.outputs.index(output)), messages))
 
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
