@@ -116,11 +116,11 @@ def live(dice, published):
                                   ) or simulation.sent_ns < until_ns:
             simulation.look_ahead(until_ns + dice.choice((0, 1, 16, 200)) * MILLISECOND,
                                   dice.choice((0.0, 1e-4, 1e-2)))
-            for output in simulation.outputs:
-                if dice.random() < 0.05:
-                    output.publish = None if output.publish else (
-                        lambda data, topic=output.channel.topic: published.append((topic, data)))
             if dice.random() < 0.5:
+                for output in simulation.outputs:
+                    if dice.random() < 0.1:
+                        output.publish = None if output.publish else (
+                            lambda data, name=output.channel.topic: published.append((name, data)))
                 simulation.refresh()
     return advance
 

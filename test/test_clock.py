@@ -58,10 +58,6 @@ def test_what_a_slow_clock_makes_due_is_on_time_for_half_a_second():
     top = Top(publishers=1).begin(100 * S + 4 * MS)
     assert top.epoch_ns == 100 * S
     assert top.tick(0, 100 * S + 4 * MS) == (4 * MS, -1), 't = 0 is on time'
-    for k in range(1, 1000):
-        before, date_ns = top.sent_ns, 100 * S + 4 * MS + k * 10 * MS // (2 * S) * 2 * S
-        assert top.tick(k * 10 * MS, date_ns)[1] <= before and top.stamp_ns == date_ns
-    assert top.clock.slip(0) == 0 and top.warnings == []
     top.begin(200 * S)
     for steady_ns, second, late_ns in (
             (0, 201, -1), (400, 202, -1), (499, 202, -1), (500, 202, 1 * S), (900, 202, 2 * S)):

@@ -89,8 +89,7 @@ def test_a_scene_with_a_moving_pivot_feels_its_acceleration(scene, expected):
     # One place, which has the velocity in the body.
     _, _, position, q, velocity, _ = found[ODOMETRY]
     for topic in ('pose', '/tf'):
-        assert np.array_equal(found[topic][2], position)
-        assert np.array_equal(found[topic][3], q)
+        assert [*map(np.array_equal, found[topic][2:], (position, q))] == [True, True]
     speed = simulation.trajectory.pivot_at(np.array([9 * S])).velocity[:, 0]
     assert np.ravel(attitude.rotated(q[-1], velocity[-1])) == pytest.approx(speed, abs=1e-14)
     sizes = np.linalg.norm(found[IMU][-1], axis=1)

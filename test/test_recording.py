@@ -88,7 +88,8 @@ def test_mcap_and_rosbags_read_every_message(tmp_path, compression):
 
 
 @pytest.mark.parametrize('count', [0, 101])
-def test_channels_and_the_metadata_of_the_bag_are_those_of_rosbag2(tmp_path, count):
+def test_channels_and_the_metadata_of_the_bag_are_those_of_rosbag2(tmp_path, monkeypatch, count):
+    monkeypatch.setenv('ROS_DISTRO', 'kilted')
     path = tmp_path / 'a "b": #ü.mcap'
     assert record(path, some_messages(count)).written[0] == count
     with open(path, 'rb') as file:
@@ -97,7 +98,7 @@ def test_channels_and_the_metadata_of_the_bag_are_those_of_rosbag2(tmp_path, cou
         metadata = {item.name: item.metadata for item in reader.iter_metadata()}
     assert profile == 'ros2' and metadata['spinning_top_sim'].items() >= METADATA.items()
     bag = yaml.safe_load(metadata['rosbag2']['serialized_metadata'])
-    expected = {'version': 9, 'storage_identifier': 'mcap', 'ros_distro': 'jazzy',
+    expected = {'version': 9, 'storage_identifier': 'mcap', 'ros_distro': 'kilted',
                 'message_count': count, 'relative_file_paths': [path.name],
                 'starting_time': {'nanoseconds_since_epoch': EPOCH_NS if count else 0},
                 'duration': {'nanoseconds': max(0, count - 1) * 1_000_000}}

@@ -75,10 +75,8 @@ class SimulatedClock:
 
     def until_grid(self, period_ns: float) -> float:
         """Return how long it is to the next multiple of a period of real time from t = 0 [ns]."""
-        if self.follows:
-            return period_ns
-        return period_ns - (self._source() - self._source_ns + self._simulated_ns / self._scale
-                            ) % period_ns
+        return 0.0 if self.follows else -(
+            self._source() - self._source_ns + self._simulated_ns / self._scale) % period_ns
 
     def _anchor(self, simulated_ns: int, source_ns: int) -> None:
         self._source_ns = self._newest_ns = source_ns

@@ -27,12 +27,9 @@ def run_node(name: str, argv: Sequence[str] | None,
     """
     Run the node of `spinning-top NAME`; return its exit code.
 
-    It is OK after an ordinary end, or WRONG_USAGE with one line that says why it cannot start.
-
     argv : arguments, None for those of the program
-    prepare : takes the arguments; returns those for ROS, and what makes the node.  Its `start` is
-        called before the executor spins, and its `stop` afterwards in any case; its Future
-        `finished` completes with the exit code, None for 0
+    prepare : takes the arguments; returns those for ROS, and what makes the node: with `start`,
+        `stop`, and a Future `finished`, which completes with the exit code, None for 0
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'

@@ -11,7 +11,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.times import NANOSECONDS, NEVER_NS, stamp_text
 
-SUBSCRIBERS_PERIOD_NS = 50_000_000      # subscribers are counted so often
+SUBSCRIBERS_PERIOD_NS = 100_000_000     # subscribers are counted so often
 AHEAD_NS = 50_000_000                   # of what is due, so much is computed ahead
 # One tick works at most this long before services and signals get their turn; so does one step.
 TICK_BUDGET_NS = 50_000_000
@@ -83,28 +83,27 @@ class Loop:
         self._clock.begin(self._simulation.epoch_ns)
         self._last_tick_ns = self._clock.steady()
 
-    def tick(self) -> None:
-        """Send what is due, then compute some of what is due next."""
-        if self.state is not LoopState.RUNNING:
-            return
-        steady_ns = self._clock.steady()
-        since_ns, self._last_tick_ns = steady_ns - self._last_tick_ns, steady_ns
-        if since_ns > 1.5 * self.tick_period_ns:
-            self.late_ticks += 1
-            self.skipped_ticks += round(since_ns / self.tick_period_ns) - 1
-        if steady_ns >= self._subscribers_due_ns:
-            self._update_subscribers()
-            self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
-        target_ns = self._advance()
-        if self._simulation.sent_ns >= target_ns:
-            self._simulation.look_ahead(target_ns + self._ahead_ns,
-                                        self.tick_period_ns / NANOSECONDS)
+    def tick(self) -> LoopState:
+        """Send what is due, then compute some of what is due next; return the state."""
+        if self.state is LoopState.RUNNING:
+            steady_ns = self._clock.steady()
+            since_ns, self._last_tick_ns = steady_ns - self._last_tick_ns, steady_ns
+            if since_ns > 1.5 * self.tick_period_ns:
+                self.late_ticks += 1
+                self.skipped_ticks += round(since_ns / self.tick_period_ns) - 1
+            if steady_ns >= self._subscribers_due_ns:
+                self._update_subscribers()
+                self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
+            if self._advance():
+                self._simulation.look_ahead(self._simulation.sent_ns + self._ahead_ns,
+                                            self.tick_period_ns / NANOSECONDS)
+        return self.state
 
-    def _advance(self) -> int:
-        """Send what is due, or what one tick has time for; return the simulated time due [ns]."""
+    def _advance(self) -> bool:
+        """Send what is due, or what one tick has time for; return whether nothing is left."""
         simulation, clock = self._simulation, self._clock
         if self.state is not LoopState.RUNNING:
-            return simulation.sent_ns
+            return True
         due_ns, late_ns, shift_ns = clock.due(simulation.epoch_ns)
         if shift_ns:
             self._recording.write(
@@ -114,9 +113,10 @@ class Loop:
         if has_room():
             self._send(target_ns, min(late_ns, target_ns) + 1,
                        lambda: clock.steady() > stop_at_ns or not has_room())
-        if simulation.sent_ns < target_ns and not self.failure:
+        arrived = simulation.sent_ns >= target_ns
+        if not arrived and not self.failure:
             self.slipped_ns += clock.slip(simulation.now_ns)
-        return target_ns
+        return arrived
 
     def _send(self, until_ns: int, publish_from_ns: int, give_way: Callable[[], bool]) -> None:
         try:
@@ -130,11 +130,7 @@ class Loop:
         self.paused = True
 
     def resume(self) -> None:
-        """
-        Let simulated time run on from where it was held, without catching up.
-
-        Raises RuntimeError if the motion has failed; a pause remains then.
-        """
+        """Let simulated time run on, without catching up, or raise RuntimeError in FAILED."""
         self._check_motion()
         if self.paused:
             self.paused = False

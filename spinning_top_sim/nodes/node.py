@@ -39,12 +39,10 @@ LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
 
 class Simulator(Node):
     """
-    The node.
+    The node.  Raises ValueError for a parameter that is not allowed.
 
     given : parameters of its command line, which those of ROS override
     values_next : what the next reset begins with; an unset spin.lz follows initial.theta
-
-    Raises ValueError for a parameter that is not allowed.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:
@@ -70,7 +68,8 @@ class Simulator(Node):
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
             error=log.error, update_subscribers=self._topics.update_subscribers)
-        self._alarms: dict[str, Timer] = {}
+        self._timer_of: dict[str, Timer] = {}       # by what it does
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._topics.open(values)
         self._diagnostics = publishers.create_publisher(
             self, DiagnosticArray, '/diagnostics')
@@ -108,38 +107,25 @@ class Simulator(Node):
     def _align_ticks(self) -> None:
         """Let ticks come just after samples are due."""
         period_ns = self.loop.tick_period_ns
-
-        def first() -> None:
-            self._every('tick', period_ns / NANOSECONDS, self._tick)
-            self._tick()
-
-        self._once('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
+        time.sleep(self.clock.until_grid(period_ns) / NANOSECONDS)
+        self._every('tick', period_ns / NANOSECONDS, self._tick)
+        self._tick()
 
     def _tick(self) -> None:
-        self.loop.tick()
+        state = self.loop.tick()
         if reason := self._recording.check():
             self._log.error(f'not recording: {reason}; the simulation goes on')
-        state = self.loop.state
         if state is LoopState.WAITING:
             self._begin()
-        elif state is LoopState.ENDED and 'end' not in self._alarms:
+        elif state is LoopState.ENDED:
             publishers.wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self._once('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
+            self._every('tick', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
 
     def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
         """Call back in steady time, each `period` [s], instead of what this timer did before."""
-        if name in self._alarms:
-            self.destroy_timer(self._alarms[name])
-        self._alarms[name] = self.create_timer(
-            period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _once(self, name: str, delay: float, callback: Callable[[], object]) -> None:
-        """Call back once, after a delay [s], instead of what this timer did before."""
-        def act() -> None:
-            self._alarms[name].cancel()
-            callback()
-
-        self._every(name, delay, act)
+        if name in self._timer_of:
+            self.destroy_timer(self._timer_of[name])
+        self._timer_of[name] = self.create_timer(period, callback, clock=self._steady)
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
@@ -179,8 +165,10 @@ class Simulator(Node):
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
         if changes.items() <= self._spin().items():     # nothing changes
             return SetParametersResult(successful=True)
-        command, others = ros_parameters.commanded(changes)
-        error, reason = self.outcome(lambda: self._change(command, others))
+        # A spin beside `initial.*` is that of the next start; alone it is a command.
+        command = {} if any(name.startswith('initial.') for name in changes) else {
+            name: changes.pop(name) for name in SPIN if name in changes}
+        error, reason = self.outcome(lambda: self._change(command, changes))
         if error is not None and command:
             self.loop.rejected_commands += 1
         return SetParametersResult(successful=error is None, reason=reason)
@@ -202,11 +190,12 @@ class Simulator(Node):
         except Exception:
             self._topics.open(self.values_next)
             raise
-        if others:          # a spin among them is that of the next start
+        if others:
             self.loop.set_parameters(values, {name: values[name] for name in sorted(
                 others.keys() - SPIN)})
-            self._align_ticks()
         self.values_next = values
+        if others:
+            self._align_ticks()
 
     def _command(self, given: Mapping[str, Any]) -> None:
         command = parameters.checked_changes(given)
@@ -216,11 +205,7 @@ class Simulator(Node):
             for name, present in self._spin().items()})
 
     def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
-        """
-        Return the error of an action, and its text.
-
-        An error other than ValueError, RuntimeError and OSError is unexpected, and raised.
-        """
+        """Return the error of an action, and its text; raise one that is unexpected."""
         try:
             return None, act() or ''
         except (ValueError, RuntimeError, OSError) as error:
@@ -257,12 +242,7 @@ class Simulator(Node):
         return f'at t = 0, stamps go on from {self.simulation.epoch_ns} ns'
 
     def start_again(self, paused: bool | None = None) -> None:
-        """
-        Reset the motion, and pause it or not; None keeps the present state.
-
-        Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
-        motion begins with the present parameters; nothing changes then.
-        """
+        """Reset the motion, as `Loop.reset` does."""
         self.loop.reset(self.values_next, paused)
         self._align_ticks()
         self.show_spin()
@@ -303,11 +283,7 @@ class Simulator(Node):
 
 
 def answers_later(service: Service) -> None:
-    """
-    Let the callback of a service return a Future of the response, which is sent when that is done.
-
-    rclpy's EventsExecutor has no coroutines for services.
-    """
+    """Let a callback return a Future of the response: EventsExecutor has no coroutines here."""
     send = service.send_response
 
     def send_when_done(future: Future, header: object) -> None:

@@ -23,11 +23,7 @@ from spinning_top_sim.streams.live import LiveSimulation
 
 
 def message_class(type_name: str) -> type:
-    """
-    Return a message class of an installed ROS package, of which publishers can be made.
-
-    Raises ValueError for any other name.
-    """
+    """Return a class of an installed package of messages.  Raises ValueError."""
     package, _, name = type_name.replace('/msg/', '/').partition('/')
     prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     try:
@@ -66,11 +62,7 @@ class ChannelPublishers:
         self.by_topic: dict[str, Publisher] = {}
 
     def open(self, values: Mapping[str, Any]) -> None:
-        """
-        Create the publishers of enabled channels, and destroy those of disabled ones.
-
-        Raises ValueError for a channel whose messages are not installed.
-        """
+        """Create the publishers of enabled channels, destroy the others.  Raises ValueError."""
         for output in self._simulation.outputs:
             topic = output.channel.topic
             enabled = parameters.is_enabled(output.channel.name, values)

@@ -22,10 +22,8 @@ Topics keep their recorded names and QoS, which `--ros-args -r FROM:=TO` and
 `-p qos_overrides.<topic>.publisher.<policy>:=...` change. Messages go out in
 the order of their log times and with their recorded bytes, old stamps included.
 
-With --clock, or a /clock in the log, time begins anew in each round of --loop,
-and so do nodes with use_sim_time, such as robot_state_publisher. Without it the
-time of other nodes goes on, and they would ignore old stamps: from the second
-round on, stamps are later by the rounds before.
+With --clock, or a /clock in the log, time begins anew in each round of --loop.
+Without it, stamps are later by the rounds before.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'

@@ -39,15 +39,13 @@ PATIENCE_S = 5.0                # Fast DDS asks every 3 s for acknowledgements
 
 class Replayer(Node):
     """
-    The node.  It plays an open log, which `stop` closes, when the executor spins.
+    The node.  It plays an open log, which `stop` closes.  Raises ValueError if it cannot.
 
     Log time runs `rate` times as fast as steady time; messages are sent when it comes to them.
 
     options : those that `replay_node.add_arguments` describes
     outputs : the publishers by the number of the channel
     sent, failed : how many messages were sent, and could not be sent
-
-    Raises ValueError if nothing can be played.
     """
 
     def __init__(self, log: LogReader, options: argparse.Namespace) -> None:

@@ -17,12 +17,8 @@ SPIN = ('spin.l3', 'spin.lz')
 
 
 def take_overrides(node: Node) -> dict[str, Any]:
-    """
-    Return the parameters that a node was started with, which can then be declared.
-
-    The node must have been made with `automatically_declare_parameters_from_overrides`, the public
-    way to learn of them.  Raises ValueError for a use_sim_time that is no bool.
-    """
+    """Return the parameters that a node was started with; these can then be declared."""
+    # It was made with `automatically_declare_parameters_from_overrides`.
     found = {name: node.get_parameter(name).value for name in node.get_parameters_by_prefix('')}
     if not isinstance(found['use_sim_time'], bool):
         raise ValueError(f'use_sim_time = {found["use_sim_time"]!r}: must be true or false')
@@ -91,10 +87,3 @@ def _with_type(name: str, value: Any) -> Any:
     with contextlib.suppress(KeyError, ValueError):
         value = parameters.BY_NAME[name].check(value)
     return list(value) if isinstance(value, tuple) else value
-
-
-def commanded(changes: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the spin that changes command, none beside `initial.*`, and the other changes."""
-    command = {} if any(name.startswith('initial.') for name in changes) else {
-        name: changes[name] for name in SPIN if name in changes}
-    return command, {name: value for name, value in changes.items() if name not in command}

@@ -92,14 +92,8 @@ class NodeStatus:
         return self._speed
 
     def status_line(self) -> str:
-        """Return the line for the terminal, with the angle in degrees."""
-        simulation, state = self._simulation, self._loop.state.name.lower()
-        motion, now_ns = simulation.trajectory, simulation.now_ns
-        regime, (l3, lz) = motion.after(now_ns).describe(), motion.momenta(now_ns)
-        theta = math.degrees(float(simulation.state().theta[0]))
-        # The most important parts come first: a terminal shows as much as fits.
-        return ' | '.join((
-            f't {now_ns / NANOSECONDS:9.2f} s {state}', regime.name if regime else '-',
-            f'theta {theta:6.2f} deg', f'x{self._measure_speed(now_ns):.2f}',
-            f'{self._total("sent")} messages to subscribers',
-            f'L3 {l3:.4g} Lz {lz:.4g}', f'energy drift {self._energy_drift():+.0e}'))
+        """Return the line for the terminal."""
+        now_ns, theta = self._simulation.now_ns, float(self._simulation.state().theta[0])
+        return (f't {now_ns / NANOSECONDS:9.2f} s {self._loop.state.name.lower()} | '
+                f'theta {math.degrees(theta):6.2f} deg | x{self._measure_speed(now_ns):.2f} | '
+                f'{self._total("sent")} messages to subscribers')

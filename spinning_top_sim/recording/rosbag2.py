@@ -8,6 +8,7 @@ Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_stora
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -111,8 +112,7 @@ def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_na
         **numbers,
         'topics_with_message_count': [
             {'topic_metadata': {
-                'name': topic.name,
-                'type': topic.type_name,
+                'name': topic.name, 'type': topic.type_name,
                 'serialization_format': 'cdr',
                 'offered_qos_profiles': [
                     {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
@@ -124,7 +124,7 @@ def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_na
         'relative_file_paths': [file_name],
         'files': [{'path': file_name, **numbers}],
         'custom_data': None,
-        'ros_distro': 'jazzy'})}
+        'ros_distro': os.environ.get('ROS_DISTRO', 'jazzy')})}
 
 
 def as_yaml(value: object) -> str:

@@ -2,21 +2,21 @@
 """
 A simulation that sends its messages in time.
 
-Messages up to `sent_ns` are sent.  The channels of one grid are computed together, a short time
-ahead, and wait as rows.  An event, another rate or another listener drops what waits.
+The channels of one grid are computed together, a short time ahead.  What is computed waits, as
+rows for the log, in one queue for subscribers.  An event, another rate or listener drops it.
 """
 
 import contextlib
 import time
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.channel import Channel, Rows
@@ -53,7 +53,7 @@ class Output:
     sent: int = 0
     skipped: int = 0
     failed: int = 0
-    # Log times [ns], as an array and as a list, and messages; so many of them are sent.
+    # For the log: log times [ns], as array and list, and rows; so many are sent, others wait.
     _log_times: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
@@ -66,18 +66,17 @@ class Output:
         return self.publish is not None or self.log_index is not None
 
     def add(self, log_times: Times, rows: Rows) -> None:
-        """Put messages behind those that wait."""
+        """Put messages behind those that wait for the log."""
         if self._taken < len(self._times):
             log_times = np.concatenate((self._log_times[self._taken:], log_times))
             rows = np.concatenate((self._rows[self._taken:], rows))
         self._log_times, self._times, self._rows = log_times, log_times.tolist(), rows
         self._taken = 0
 
-    def take(self, until_ns: int) -> tuple[Times, list[int], Rows]:
-        """Return what waits up to a log time [ns], which waits no longer."""
-        begin, end = self._taken, bisect_right(self._times, until_ns, self._taken)
-        self._taken = end
-        return self._log_times[begin:end], self._times[begin:end], self._rows[begin:end]
+    def take(self, until_ns: int) -> tuple[Times, Rows]:
+        """Return what waits for the log up to a log time [ns], and waits no longer."""
+        begin, self._taken = self._taken, bisect_right(self._times, until_ns, self._taken)
+        return self._log_times[begin:self._taken], self._rows[begin:self._taken]
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -123,9 +122,9 @@ class LiveSimulation(Simulation):
                channels: Sequence[Channel] = ()) -> None:
         """Record these channels, numbered in this order, and no others after `sent_ns`."""
         self._write = write or self._write
+        numbers = {channel: number for number, channel in enumerate(channels)}
         for output in self.outputs:
-            output.log_index = (channels.index(output.channel) if output.channel in channels
-                                else None)
+            output.log_index = numbers.get(output.channel)
         self.refresh()
 
     def apply(self, kind: str, **details: Any) -> Event:
@@ -141,19 +140,16 @@ class LiveSimulation(Simulation):
 
     def refresh(self) -> None:
         """Compute anew what waits: the motion, or who takes the messages, has changed."""
-        # Those that are used, with their numbers.
-        self._used = [one for one in enumerate(self.outputs) if one[1].is_used]
+        # For subscribers: log times [ns], numbers of outputs, messages.
+        self._waiting: deque[tuple[int, int, bytes]] = deque()
         outputs_of: dict[tuple[int, int], dict[Channel, Output]] = {}
-        for _, output in self._used:
+        for output in self.outputs:
             output.take(NEVER_NS)
-            outputs_of.setdefault(output.channel.grid, {})[output.channel] = output
+            if output.is_used:
+                outputs_of.setdefault(output.channel.grid, {})[output.channel] = output
         self._grids = [_Progress(self.sent_ns, FIRST_SPAN_NS, outputs)
-                       for outputs in outputs_of.values()]
-
-    @property
-    def _ready_ns(self) -> int:
-        """Time up to which all messages are sent or wait [ns]."""
-        return min(one.computed_ns for one in self._grids or [self._motion])
+                       for outputs in outputs_of.values()] or [self._motion]
+        self._ready_ns = self.sent_ns       # up to here all messages are sent or wait
 
     def send(self, due_ns: int, publish_from_ns: int = 0,
              give_way: Callable[[], bool] = lambda: False) -> bool:
@@ -177,7 +173,7 @@ class LiveSimulation(Simulation):
 
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """Compute some of what is due up to a time, for one grid; it may take so long."""
-        if self._grids and self._ready_ns < until_ns:
+        if self._ready_ns < until_ns:
             behind = min(self._grids, key=attrgetter('computed_ns'))
             span_ns = min(behind.span_ns, LONGEST_SPAN_NS)
             with contextlib.suppress(IntegrationError):     # `send` meets it in time
@@ -192,6 +188,8 @@ class LiveSimulation(Simulation):
                 raise
         for grid in grids:
             self._compute(grid, min(goal_ns, self._motion.computed_ns), seconds)
+        self._waiting = deque(sorted(self._waiting))
+        self._ready_ns = min(grid.computed_ns for grid in self._grids)
         self.forget()
 
     def _compute(self, part: _Progress, until_ns: int, seconds: float) -> None:
@@ -202,28 +200,38 @@ class LiveSimulation(Simulation):
             if part is self._motion:
                 goal_ns = self.reach(part.computed_ns, goal_ns)
             for channel, t_ns, rows in self.messages(part.outputs, part.computed_ns, goal_ns):
-                part.outputs[channel].add(self.epoch_ns + t_ns, rows)
+                self._add(part.outputs[channel], self.epoch_ns + t_ns, rows)
             done_ns, called = goal_ns - part.computed_ns, now
             part.computed_ns, now = goal_ns, self._clock()
             # Where it took too long, the next piece is a half of it, else up to twice as long.
             part.span_ns = (max(1, done_ns // 2) if now - called > 0.5 * seconds
                             else max(part.span_ns, 2 * done_ns))
 
+    def _add(self, output: Output, log_times: Times, rows: Rows) -> None:
+        """Let messages of an output wait."""
+        if output.log_index is not None:
+            output.add(log_times, rows)
+        if output.publish is not None:
+            messages = rows.view(f'V{rows.shape[1]}')[:, 0].tolist()    # bytes, all at once
+            self._waiting.extend(zip(
+                log_times.tolist(), repeat(self.outputs.index(output)), messages))
+
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
+        end_ns, late_ns = self.epoch_ns + until_ns, self.epoch_ns + publish_from_ns
         logged: list[LogRows] = []
-        due: list[tuple[int, int, NDArray[np.uint8]]] = []
-        for number, output in self._used:
-            log_times, times, rows = output.take(self.epoch_ns + until_ns)
-            if times and output.log_index is not None:
-                logged.append((output.log_index, log_times, rows))
-            if output.publish is not None:
-                late = bisect_left(times, self.epoch_ns + publish_from_ns)
-                output.skipped += late
-                due += zip(times[late:], repeat(number), rows[late:])
+        for output in self.outputs:
+            if output.log_index is not None:
+                log_times, rows = output.take(end_ns)
+                if len(rows):
+                    logged.append((output.log_index, log_times, rows))
         if logged:
             self._write(logged)
         self.sent_ns = until_ns
-        due.sort(key=itemgetter(0, 1))
-        for _, number, row in due:
-            self.outputs[number].send(row.tobytes())
+        waiting = self._waiting
+        while waiting and waiting[0][0] <= end_ns:
+            log_time, number, message = waiting.popleft()
+            if log_time < late_ns:
+                self.outputs[number].skipped += 1
+            else:
+                self.outputs[number].send(message)

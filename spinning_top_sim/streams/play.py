@@ -89,7 +89,10 @@ class Simulation:
             self.trajectory = self.trajectory.then(event)
             self.sent_ns = event.t_ns
         elif kind == 'parameters':
-            self._take_over(details)
+            values = self.values_in_effect
+            values |= {name: details[name] for name in parameters.AT_ONCE & details.keys()}
+            self.imu = self.imu.at_period(period_ns(values['imu.rate']), self.now_ns)
+            self.channels = all_channels(values, self.imu)
         elif kind == 'epoch':
             check_stamp(details['epoch_ns'])
             self.epoch_ns = details['epoch_ns']
@@ -101,19 +104,8 @@ class Simulation:
             self.history.append(event)
         return event
 
-    def _take_over(self, changes: Mapping[str, Any]) -> None:
-        """Make the channels after `sent_ns` of the changes that take effect at once."""
-        values = self.values_in_effect
-        values |= {name: changes[name] for name in parameters.AT_ONCE & changes.keys()}
-        self.imu = self.imu.at_period(period_ns(values['imu.rate']), self.now_ns)
-        self.channels = all_channels(values, self.imu)
-
     def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:
-        """
-        Return the details of a drive to a velocity of the pivot in the world [m/s] from now on.
-
-        None if the pivot rests and is to rest.  Raises ValueError.
-        """
+        """Return the details of a drive to a velocity in the world [m/s]; None: it rests, too."""
         x, y, z = target = [float(part) for part in velocity]
         if not all(abs(part) <= parameters.FASTEST for part in target):
             raise ValueError(f'linear = {target!r} m/s: each must be finite and within '

@@ -55,9 +55,3 @@ def events_in(log):
     """Return the journal of a log: one JSON object a std_msgs/String."""
     (rows,) = [rows for topic, rows in log.items() if topic.endswith('/events')]
     return [json.loads(data[8:].rstrip(b'\0')) for _, data in rows]
-
-
-def assert_clean_end(node, code):
-    assert code == 0, node.err
-    assert TRACEBACK not in node.err, node.err
-    assert TRACEBACK not in node.out, node.out
