@@ -13,7 +13,6 @@ from spinning_top_sim.grade.causes import OFFSETS, judge
 from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Comparison, Imu
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
-from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
@@ -101,7 +100,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     body = body.part(slice(first, first + count))       # in which it turns the most
 
     # No convention changes how fast quaternions change, and so none the noise in rates.
-    widths = {name: compared.motions[0].width for name in ('gyroscope', 'accelerations')
+    widths = {name: compared.motions[0][0].width for name in ('gyroscope', 'accelerations')
               if (compared := Comparison(name, [body], imu, gravity)).motions}
     if not widths:
         return ours
@@ -111,11 +110,12 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
         told, shares = undone(body, convention), np.full(len(widths), math.inf)
         for k, (name, width) in enumerate(widths.items()):
             compared = Comparison(name, [told], imu, sign * gravity, [width])
-            compared.compare(0)
-            found, _, residual = compared.fit(['total', *compared.always, *OFFSETS])
-            right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1
-                        for size in compared.units.values())
-            shares[k] = beyond(residual, compared.floor) if right else 1.0
+            model = compared.model(0)
+            fit = model.fit(['total', *OFFSETS])
+            right = not model.clear('total', 10.0) or any(
+                abs((1.0 + fit.found[len(compared.always)]) * size - 1.0) < 0.1
+                for size in compared.units.values())
+            shares[k] = fit.beyond if right else 1.0
             if shares[k] > most:
                 break
         return shares

@@ -7,7 +7,7 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -15,9 +15,9 @@ import numpy as np
 from spinning_top_sim.grade.causes import GRAVITY_BAND, listed
 from spinning_top_sim.grade.columns import AXES, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import Body
-from spinning_top_sim.tools import identify
-from spinning_top_sim.tools.identify import NEAR, Cause, Verdict, instead, rms
+from spinning_top_sim.tools.identify import NEAR, TARGET, Cause, Model, explain, instead, rms
 from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
+from spinning_top_sim.tools.report import Finding
 
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
@@ -26,12 +26,13 @@ EXPLAINED = 0.25    # of the discrepancy is left at most
 SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
-def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Verdict]:
+def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Finding]:
     """Return the causes of the error of motions of a body."""
-    target, effects = identify.pooled(_terms(body, motion, dt) for motion in motions)
-    if rms(target) < UNIMPORTANT:
+    parts = [_terms(body, motion, dt) for motion in motions]
+    model = Model({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    if model.size(TARGET) < UNIMPORTANT:
         return []
-    chosen = identify.explain(target, effects, [
+    found, rest = explain(model, [
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(
             'inertia_frame', 'the gyroscopic term is that of moments of inertia about axes of the '
@@ -39,14 +40,10 @@ def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Verdict
         Cause(['damping', 'axis damping'], _damping),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
-    names = [name for cause in chosen for name in cause.effects]
-    found, residual = identify.fitted(target, [effects[name] for name in names]) if names else (
-        np.empty(0), target)
-    return [one for one in identify.verdicts(chosen, found) if one] if (
-        rms(residual) < EXPLAINED * rms(target)) else []
+    return found if rest.rest < EXPLAINED * model.size(TARGET) else []
 
 
-def _terms(body: Body, motion: Stretch, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
+def _terms(body: Body, motion: Stretch, dt: float) -> dict[str, Reals]:
     """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
     smoothed = Smoothed(motion, 1)
     step, w, inertia = motion.step, smoothed.rates, body.inertia
@@ -62,40 +59,40 @@ def _terms(body: Body, motion: Stretch, dt: float) -> tuple[Reals, Mapping[str, 
              'damping': -w * (1.0, 1.0, 0.0), 'axis damping': -w * AXES[2],
              **{f'arm {k}': arm for k, arm in enumerate(arms)},
              **{f'euler {k}': term for k, term in enumerate(euler)}}
-    effects = {name: sum(weight * node[at:len(node) - 5 + at] for at, weight in enumerate(_MEAN))
+    effects: dict[str, Reals] = {name: sum(weight * node[at:len(node) - 5 + at] for at, weight in enumerate(_MEAN))
                for name, node in nodes.items()}
     for name in ('gyroscopic', 'gravity'):
         effects[f'{name} step'] = dt / step * np.diff(nodes[name], axis=0)[2:-2]
     change = np.diff(w, axis=0)[2:-2] / step
-    size = 1.0 / (rms(change) or 1.0)
-    return size * (change - effects['gyroscopic'] - effects['gravity']), {
-        name: size * effect for name, effect in effects.items()}
+    effects[TARGET] = change - effects['gyroscopic'] - effects['gravity']
+    size = rms(change) or 1.0
+    return {name: effect / size for name, effect in effects.items()}
 
 
-def _gyroscopic(found: Reals) -> Verdict | None:
+def _gyroscopic(found: Reals) -> Finding | None:
     share = 1.0 + float(found[0])
-    return None if share >= NEAR else Verdict(      # else it is the moments
+    return None if share >= NEAR else Finding(      # else it is the moments
         'no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
         f'the gyroscopic term w x I w has {share:.3g} times its size', share)
 
 
-def _step(found: Reals) -> Verdict:
+def _step(found: Reals) -> Finding:
     at, gravity_at = (0.5 + found).tolist()
     name, means = (('first_order', f'gravity at {gravity_at:.3g}') if
                    abs(found[0]) < 0.5 * abs(found[1]) else
                    ('implicit_damping', 'it removes energy') if at > 0.5 else
                    ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
                    ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
-    return Verdict(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
+    return Finding(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
                    f'is 0.5: {means}', at)
 
 
-def _damping(found: Reals) -> Verdict:
-    return Verdict('damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the '
+def _damping(found: Reals) -> Finding:
+    return Finding('damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the '
                    f'axis and {found[1]:.3g} 1/s about it', float(found[0]))
 
 
-def _com(body: Body, found: Reals) -> Verdict:
+def _com(body: Body, found: Reals) -> Finding:
     com, size = found + body.com, float(np.linalg.norm(found))
     ratio = float(com[2]) / (body.com_distance or np.inf)
     along_axis = np.linalg.norm(found[:2]) < SIDEWAYS * size
@@ -103,13 +100,13 @@ def _com(body: Body, found: Reals) -> Verdict:
         ('gravity', ratio * body.gravity) if along_axis and (
             abs(ratio * body.gravity / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND) else
         ('gravity_sign', ratio) if along_axis and ratio < 0.0 else ('com_offset', size))
-    return Verdict(name, f'the torque of gravity is {ratio:.5g} times its size, as of a centre of '
+    return Finding(name, f'the torque of gravity is {ratio:.5g} times its size, as of a centre of '
                    f'mass at ({listed(com)}) m', number)
 
 
-def _inertia(body: Body, found: Reals) -> Verdict | None:
+def _inertia(body: Body, found: Reals) -> Finding | None:
     shares = 1.0 + found[:2]
-    return None if np.any(shares <= 0.0) else Verdict(
+    return None if np.any(shares <= 0.0) else Finding(
         'inertia', 'the motion is that of moments of inertia across the axis of '
         f'{listed(body.lambda1 / shares)} kg m^2, not {body.lambda1:.4g}',
         float(body.lambda1 / shares[0]))
