@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.columns import (
-    AXES, DENSITIES, ENTRIES, STANDARD_GRAVITY, Comparison, Imu)
+    AXES, DENSITIES, ENTRIES, OF_TURNS, STANDARD_GRAVITY, Comparison, Imu)
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.identify import (
     NEAR, NO_FAULT, SURE, TARGET, Cause, Fit, Model, explain, instead)
@@ -122,7 +122,7 @@ class Causes:
             return
         yield Cause(OFFSETS, self._bias)
         for effect, name, text in (
-                ('world', 'rates_in_world' if self.compared.angles else 'reading_in_world',
+                ('world', 'rates_in_world' if self.kind in OF_TURNS else 'reading_in_world',
                  'the world, not of the IMU'),
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
             yield Cause([*(f'in world {arm}' for arm in self.arms), 'total', effect], instead(
@@ -266,7 +266,7 @@ def _estimates(compared: Comparison, model: Model) -> dict[str, Mark]:
 
 def _untold(compared: Comparison, model: Model) -> Iterator[str]:
     """Yield what cannot be told of the readings, and the poses that could tell it."""
-    terms = [name for name in (('total',) if compared.angles else ('centripetal', 'linear'))
+    terms = [name for name in (('total',) if compared.kind in OF_TURNS else ('centripetal', 'linear'))
              if name in model.names and model.size(name) > 0.0]
     turns, places = (max(one.body.sigma.get(name, 0.0) for one, _ in compared.motions)
                      for name in ('attitudes', 'positions'))

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What a sensor should read in a motion, term by term, and what defects change of it.
-
-A motion, exact or with noise, is a source of columns, and readings are compared with these.
-"""
+"""What a sensor should read in a motion, term by term, and what defects change of it."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,12 +18,12 @@ ENTRIES = [(i, j) for i in range(3) for j in range(3)]
 STANDARD_GRAVITY = 9.80665
 NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR, NOISY = 0.03, 1e-3   # noise of what a motion tells, relative to it: small; that counts
+ARM = np.full(3, 0.06)  # of an IMU whose place is not known [m]
 LAGS = range(-5, 41)    # that are tried [samples]
 ENOUGH = 3              # independent samples a column, from which on a lag can be told
-ARM = np.full(3, 0.06)   # of an IMU whose place is not known [m]
 STILL = 1e-5            # share of a reading below which no lag is looked for
-# Effects that any reading may have, along any axes.
-ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field'
+# Terms and effects that any reading may have, along any axes.
+ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field', 'rates'
 _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 _RATES = {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0, 'dps': math.pi / 180.0,
           'rpm': math.pi / 30.0}
@@ -40,6 +36,7 @@ READINGS: dict[str, Mapping[str, float]] = {
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
 # Those of a simulator may be the rates of its state, too.
 KINDS = {'rates': _RATES, **READINGS}
+OF_TURNS = 'rates', 'gyroscope'
 DENSITIES = {'gyroscope': 'gyroscope_noise_density',
              'accelerations': 'accelerometer_noise_density'}
 
@@ -98,7 +95,6 @@ class Comparison:
     def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
                  widths: Sequence[int] = kinematics.WIDTHS) -> None:
         self.kind, self.gravity, self.units = kind, gravity, KINDS[kind]
-        self.angles = kind in ('rates', 'gyroscope')
         self.arm, self.field = (np.array(one or np.zeros(3)) for one in (imu.lever_arm, imu.field))
         known = {'accelerations': imu.lever_arm, 'magnetometer': imu.field}.get(kind, ())
         self.always = [f'{"field" if kind == "magnetometer" else "arm"} {k}'
@@ -109,37 +105,35 @@ class Comparison:
         self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
-        share, self.motions = self._clear(stretches, widths)
-        self.noisy = share > NOISY
+        self.motions, self.noisy = self._clear(stretches, widths)
         if self.always and self.motions and kind == 'accelerations':
             self.arm = self.model(0).fit([]).found
 
-    def _clear(self, stretches: Sequence[Stretch],
-               widths: Sequence[int]) -> tuple[float, list[tuple[Smoothed, Smoothed]]]:
-        """Return the share of noise, and the motions smoothed so that it is small."""
-        best: tuple[float, list[tuple[Smoothed, Smoothed]]] = math.inf, []
-        random = np.random.default_rng(0)
+    def _clear(self, stretches: Sequence[Stretch], widths: Sequence[int],
+               ) -> tuple[list[tuple[Smoothed, Smoothed]], bool]:
+        """Return the motions, smoothed so that their noise is small, and whether it counts."""
+        least, motions, random = math.inf, list[tuple[Smoothed, Smoothed]](), (
+            np.random.default_rng(0))
         pairs = [(one, one.noisier(random)) for one in stretches]
-        arm = self.arm if np.any(self.arm) else ARM
         for width in (1,) if self.kind in ('rates', 'magnetometer') else widths:
             if min((len(one.t) for one in stretches), default=0) < 4 * kinematics.margin(width):
                 break
-            motions = [(Smoothed(one, width), Smoothed(two, width)) for one, two in pairs]
+            smoothed = [(Smoothed(one, width), Smoothed(two, width)) for one, two in pairs]
             plain, noisy = (np.concatenate([
-                one.rates if self.angles else one.back @ UP if self.kind == 'magnetometer'
-                else one.acceleration + one.second @ arm for one in every])
-                for every in zip(*motions, strict=True))
-            noise = rms(noisy - plain)
-            share = noise / max(math.sqrt(max(rms(plain) ** 2 - noise ** 2, 0.0)), 1e-12)
-            best = min(best, (share, motions), key=lambda one: one[0])
+                one.acceleration + one.second @ (self.arm if np.any(self.arm) else ARM)
+                if self.kind == 'accelerations' else one.rates for one in every])
+                for every in zip(*smoothed, strict=True))
+            share = rms(noisy - plain) / max(rms(plain), 1e-12)
+            if share < least:
+                least, motions = share, smoothed
             if share < CLEAR:
                 break
-        return best
+        return motions, least > NOISY
 
     def read(self, motion: Smoothed, lag: int) -> Reals:
         """Return readings that are `lag` samples late, smoothed (m, 3); ends are wrapped."""
         reading = self.mounting.apply(np.roll(motion.body.readings[self.kind], -lag, axis=0))
-        return (motion.rate if self.angles else motion.vector)(reading)
+        return (motion.rate if self.kind in OF_TURNS else motion.vector)(reading)
 
     def lag(self) -> tuple[float, float, bool]:
         """
@@ -148,24 +142,23 @@ class Comparison:
         The reading is regressed on all terms, of all axes, at each lag: what else is wrong does
         not count.
         """
-        motions = [one for one, _ in self.motions]
+        motions, residuals = [one for one, _ in self.motions], []
         lags = [lag for lag in LAGS if 4 * abs(lag) < min(len(one.rates) for one in motions)]
-        keep, residuals = slice(-lags[0], -lags[-1] or None), []
         for motion in motions:
-            good = motion.smooth[keep]
-            design = np.hstack([effect[keep][good] for name, effect in self.columns(motion).items()
-                                if name.startswith(ANY) or (name == 'total' and self.angles)]
-                               + [np.ones((np.count_nonzero(good), 1))])
+            good = np.flatnonzero(motion.smooth)
+            good = good[(good >= -lags[0]) & (good < len(motion.smooth) - lags[-1])]
+            design = np.hstack([effect[good] for name, effect in self.columns(motion).items()
+                                if name.startswith(ANY)] + [np.ones((len(good), 1))])
             design /= np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-            read = np.hstack([self.read(motion, lag)[keep][good] for lag in lags])
+            read = np.hstack([self.read(motion, lag)[good] for lag in lags])
             residuals.append(read - design @ np.linalg.lstsq(design, read, rcond=1e-9)[0])
-        misfit = sum(np.sum(one ** 2, axis=0) for one in residuals).reshape(-1, 3).sum(axis=1)
+        misfit = np.sum(np.concatenate(residuals) ** 2, axis=0).reshape(-1, 3).sum(axis=1)
         best, now, count = int(np.argmin(misfit)), misfit[lags.index(0)], 3 * sum(
             map(len, residuals))
-        width = motions[0].width
+        width, size = motions[0].width, rms(self.sizes)
         # Of smoothed samples fewer are independent: they must be more than the columns.
         if (count < ENOUGH * 3 * width * design.shape[1] or best in (0, len(lags) - 1)
-                or now < count * (STILL * rms(self.sizes)) ** 2):
+                or now < count * (STILL * size) ** 2):
             return math.nan, math.inf, False    # every lag explains it
         # Around its minimum the sum of squares is a parabola.
         sooner, least, later = misfit[best - 1:best + 2].tolist()
@@ -175,36 +168,34 @@ class Comparison:
         variance = rest / count * 2.0 * width   # of correlated noise
         sigma, unlike = math.sqrt(2.0 * variance / curvature), (2.0 * SURE) ** 2 * variance
         likely = np.abs(np.array(lags)[misfit - rest < unlike] - late)
-        if np.any(likely > 1.0 + 2.0 * SURE * sigma) or now - rest < unlike * (
-                abs(late) > 2.0 * sigma):
+        sure = now - rest > unlike
+        if np.any(likely > 1.0 + 2.0 * SURE * sigma) or not (sure or abs(late) < 2.0 * sigma):
             return math.nan, math.inf, False    # others, or none, explain it as well
-        noise = count * (self.model(0).fit([]).noise * rms(self.sizes)) ** 2
-        clear = rest < 0.25 * now or (rest < 1.5 * noise and now - rest > max(
-            unlike, 0.05 * curvature * late ** 2))
-        return late, sigma, clear
+        noise = count * (self.model(0).fit([]).noise * size) ** 2
+        return late, sigma, sure and rest < max(0.25 * now, 1.5 * noise)
 
     def model(self, lag: int) -> Model:
         """Return what readings that are `lag` samples late may contain beside what is right."""
         keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
-        plain, noisy = [], []
+        every: tuple[list[dict[str, Reals]], ...] = [], []
         for pair, size in zip(self.motions, self.sizes, strict=True):
             smooth = pair[0].smooth[keep]
-            for motion, every in zip(pair, (plain, noisy), strict=True):
+            for motion, parts in zip(pair, every, strict=True):
                 effects = self.columns(motion)
                 effects[TARGET] = self.read(motion, lag) - effects['total']
-                every.append({name: one[keep][smooth] / size for name, one in effects.items()})
-        return Model(*({name: np.concatenate([one[name] for one in every]) for name in every[0]}
-                       for every in (plain, noisy)), self.always)
+                parts.append({name: one[keep][smooth] / size for name, one in effects.items()})
+        return Model(*({name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
+                       for parts in every), self.always)
 
     def columns(self, motion: Smoothed) -> dict[str, Reals]:
-        """Return the known terms of a right reading, their sum `total`, and effects of defects."""
-        if self.angles:
-            effects = {'total': motion.rates}
+        """Return the terms of a right reading, their sum `total`, and effects of defects."""
+        if self.kind == 'accelerations':
+            effects = self._of_forces(motion)
         elif self.kind == 'magnetometer':
             effects = {f'field {k}': motion.back @ axis for k, axis in enumerate(AXES)}
             effects['total'] = motion.back @ self.field
         else:
-            effects = self._of_forces(motion)
+            effects = {'rates': motion.rates, 'total': motion.rates}
         total = effects['total']
         arms = self.always if self.kind == 'accelerations' else []
 
@@ -212,7 +203,8 @@ class Comparison:
             return self.mounting.apply(along(motion.turn, reading))
 
         effects |= {
-            'step': _per_step(effects.get('whole', total)), 'world': turned(total), 'reversed': turned(turned(total)),
+            'step': _per_step(effects.get('whole', total)), 'world': turned(total),
+            'reversed': turned(turned(total)),
             **{f'in world {arm}': turned(effects[arm]) for arm in arms},
             **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
         for of in ('total', *arms):
@@ -221,17 +213,18 @@ class Comparison:
         return effects
 
     def _of_forces(self, motion: Smoothed) -> dict[str, Reals]:
+        """Return the terms of a specific force, `total` without those of an unknown arm."""
         second, transposed = motion.second, motion.second.transpose(0, 2, 1)
         tangential, centripetal = (0.5 * (second + sign * transposed) @ self.arm
                                    for sign in (-1.0, 1.0))
-        lever, gravity = tangential + centripetal, self.gravity * motion.back @ UP
-        known, whole = gravity + motion.acceleration, gravity + motion.acceleration + lever
+        gravity, moved = self.gravity * motion.back @ UP, motion.acceleration + second @ self.arm
         return {
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
-            'linear': motion.acceleration, 'lever': lever, 'total': known if self.always else whole, 'whole': whole,
+            'linear': motion.acceleration, 'lever': second @ self.arm, 'whole': gravity + moved,
+            'total': gravity + (motion.acceleration if self.always else moved),
             'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.
-            'difference': along(motion.back, _per_step(along(motion.turn, whole - gravity))),
+            'difference': along(motion.back, _per_step(along(motion.turn, moved))),
             # A lever arm that is longer by 1 m along axes of the body, and a x r alone.
             **{f'arm {k}': second[:, :, k] for k in range(3)},
             **{f'turned arm {k}': 0.5 * (second - transposed)[:, :, k] for k in range(3)}}

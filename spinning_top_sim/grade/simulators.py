@@ -27,10 +27,7 @@ Simulate = Callable[[Body, Start, Reals, float], Any]
 TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
 WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
-
-
-class InvalidTrajectoryError(ValueError):
-    """A simulator has returned no motion; the text names what and why."""
+SLOW = 0.25             # share of an error that follows from wrong rates from the start on
 
 
 def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
@@ -84,7 +81,7 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
                 continue
             try:
                 judgement.run(run, scene, start)
-            except InvalidTrajectoryError as error:
+            except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
     if len(unjudged) == len(scenes):
         raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
@@ -96,37 +93,32 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
 
 
 def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Stretch:
-    """Return the motion that a run says.  Raises InvalidTrajectoryError."""
+    """Return the motion that a run says.  Raises ValueError."""
     try:
         said = run(body, start, times.copy(), dt)
     except (Exception, SystemExit) as error:
-        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
-                                     f'{one_line(error)}') from error
+        raise ValueError(f'run raises {type(error).__name__}: {one_line(error)}') from error
     said = said if isinstance(said, Mapping) else {'attitudes': said}
     readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
                 for name in ('attitudes', *KINDS) if said.get(name) is not None}
     if 'attitudes' not in readings:
-        raise InvalidTrajectoryError(
-            f'what is returned has {[name for name in said if said[name] is not None]}: must have '
-            'attitudes')
+        raise ValueError(f'what is returned has {[*said]}: must have attitudes')
     attitudes = readings.pop('attitudes')
     for at in np.flatnonzero(np.abs(np.linalg.norm(attitudes, axis=1) - 1.0) > NORM)[:1]:
-        raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
-                                     'must be 1')
+        raise ValueError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm must be 1')
     return Stretch(times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
                    {name: white(values, jumps=False) for name, values in readings.items()})
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
-    """Return an array of this shape.  Raises InvalidTrajectoryError."""
+    """Return an array of this shape.  Raises ValueError."""
     try:
         numbers = np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InvalidTrajectoryError(f'{name}: {error}') from error
-    if numbers.shape != shape:
-        raise InvalidTrajectoryError(f'{name} has shape {numbers.shape}: must be {shape}')
-    for at in np.argwhere(~np.isfinite(numbers))[:1]:
-        raise InvalidTrajectoryError(f'{name}{at.tolist()} = {numbers[tuple(at)]}: must be finite')
+        raise ValueError(f'{name}: {error}') from error
+    if numbers.shape != shape or not np.all(np.isfinite(numbers)):
+        raise ValueError(f'{name} has shape {numbers.shape}, {np.sum(~np.isfinite(numbers))} '
+                         f'numbers are not finite: must be {shape}, all finite')
     return numbers
 
 
@@ -136,13 +128,13 @@ class Motion:
     What is told of a motion.
 
     worst : its largest angle to the exact attitudes [rad]
-    of_start : share of it that follows from wrong rates in the first step
+    slow : whether that follows from wrong rates in the first step
     """
 
     name: str
     told: Stretch
     worst: float
-    of_start: float = 0.0
+    slow: bool = False
 
 
 class Judgement:
@@ -155,23 +147,22 @@ class Judgement:
         self.orders: dict[str, float] = {}
 
     def run(self, run: Simulate, scene: Scene, start: Start) -> None:
-        """Add the motion of a scene.  Raises InvalidTrajectoryError."""
+        """Add the motion of a scene.  Raises ValueError."""
         times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
-
         told = [told_motion(run, self.body, start, times, self.dt / divided)
                 for divided in scene.divided]
         if not self.motions and not np.array_equal(told[0].matrices, told_motion(
                 run, self.body, start, times, self.dt).matrices):
             self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
                                        'same run twice differ'))
-        for name, values in {'attitudes': told[0].rotation.as_quat(), **told[0].readings}.items():
-            _, hold = held(name, values)
-            if hold:                            # what is held is not graded
-                self.faults.append(hold._replace(evidence=f'{scene.name}: {hold.evidence}'))
-                if name == 'attitudes':
-                    return
-                told[0].readings = {kind: one for kind, one in told[0].readings.items()
-                                    if kind != name}
+        readings = {'attitudes': told[0].rotation.as_quat(), **told[0].readings}
+        holds = {name: hold for name, values in readings.items()
+                 for hold in held(f'{scene.name}: {name}', values)[1]}
+        self.faults += holds.values()
+        if 'attitudes' in holds:                # what is held is not graded
+            return
+        told[0].readings = {name: one for name, one in told[0].readings.items()
+                            if name not in holds}
         same = [self.beside_truth(scene.name, start, one) for one in told]
         self.motions.append(same[0])
         errors = [one.worst for one in same]
@@ -181,61 +172,55 @@ class Judgement:
 
     def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
-        solution, early = ExactSolution(self.body, start), slice(0, EARLY)
+        solution = ExactSolution(self.body, start)
 
         def errors_of(told: Stretch, late: int = 0) -> Reals:
             truth = solution.states_at_seconds(told.t - late * self.dt).quaternion
             return (Rotation.from_quat(truth).inv() * told.rotation).magnitude()
 
         errors = errors_of(told)
-        error = float(np.max(errors[early]))
+        error = float(np.max(errors[:EARLY]))
         for late in (-1, 1) if error > min(WRONG, 2.0 * self.tolerance) else ():
             other = errors_of(told, late)
-            if np.max(other[early]) < RIGHT * error and np.median(other) < RIGHT * np.median(
-                    errors):
+            if np.max(other[:EARLY]) < RIGHT * error:
                 self.faults.append(Finding(
                     'late' if late > 0 else 'early', f'{name}: the attitudes are those of '
                     f'one step {"before" if late > 0 else "after"}', float(late)))
                 return Motion(name, told, float(np.max(other)))
         if error > WRONG:
             q = told.rotation.as_quat()
-            found = conventions.best(q[early], solution.states_at_seconds(
-                told.t[early]).quaternion)
+            found = conventions.best(q[:EARLY], solution.states_at_seconds(
+                told.t[:EARLY]).quaternion)
             if found.convention.parts and found.after < RIGHT * found.before:
                 self.faults.append(Finding(
                     'convention', f'{name}: attitudes are told as {found.convention.name}; '
                     'this is undone', found.before))
                 told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
                 errors = errors_of(told)
-        return Motion(name, told, float(np.max(errors)), self._of_start(told, solution, errors))
-
-    def _of_start(self, told: Stretch, solution: ExactSolution, errors: Reals) -> float:
-        """Return the share of errors that is as by the wrong turn in the first step."""
-        at = int(np.argmax(errors >= 0.5 * np.max(errors)))
+        # Rates of the first step, which may be those of its beginning or of its end.
         truth = solution.states_at_seconds(told.t[:2])
-        turned, right = ((turn[0].inv() * turn[1]).as_rotvec() / self.dt
-                         for turn in (told.rotation[:2], Rotation.from_quat(truth.quaternion)))
-        along = truth.angular_velocity[0] / (np.linalg.norm(truth.angular_velocity[0]) or 1.0)
-        # A step may turn by the rates of its beginning or of its end.
-        unclear = self.dt * abs(float(truth.angular_acceleration[0] @ along))
-        return max(abs(float((turned - right) @ along)) - unclear, 0.0) * float(
-            told.t[at] / (errors[at] or 1.0))
+        turned, right = (float((turn[0].inv() * turn[1]).magnitude()) / self.dt
+                         for turn in (told.rotation, Rotation.from_quat(truth.quaternion)))
+        w, change = truth.angular_velocity[0], self.dt * truth.angular_acceleration[0]
+        doubt = abs(float(w @ change)) / (float(np.linalg.norm(w)) or 1.0)
+        at = int(np.argmax(errors >= 0.5 * np.max(errors)))
+        return Motion(name, told, float(np.max(errors)), (
+            abs(turned - right) - doubt) * float(told.t[at]) > SLOW * float(errors[at]))
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
         if not self.motions:
             return
         of_rates = self._readings('rates').found
-        first = of_rates[0].name if of_rates else ''
-        wrong = max(motion.worst for motion in self.motions) > self.tolerance
-        if not first or (wrong and first == 'rates_scale'):     # rates that are told are known
+        scaled = [one.name for one in of_rates] == ['rates_scale'] and max(
+            motion.worst for motion in self.motions) > self.tolerance
+        if not of_rates or scaled:              # rates that are told are known
             for motion in self.motions:
                 motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
-        yield Report('rates', of_rates)
-        found = [fault for fault in self._of_motions() if not (
-            first == 'rates_scale' and fault.name == 'inaccurate')]
-        yield Report('motions', found, {
-            name: mark for motion in self.motions for name, mark in self._marks(motion)})
+        yield Report('', of_rates)
+        yield Report('', [one for one in self._of_motions() if not (
+            scaled and one.name == 'inaccurate')], {
+                name: mark for motion in self.motions for name, mark in self._marks(motion)})
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
@@ -250,8 +235,8 @@ class Judgement:
         yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
                                                       math.degrees(self.tolerance))
         smoothed = Smoothed(motion.told, 1)
-        w, up = smoothed.rates, smoothed.turn[:, 2, 2]
-        energy = 0.5 * w ** 2 @ self.body.inertia + self.body.gravity_torque * up
+        energy = (0.5 * smoothed.rates ** 2 @ self.body.inertia
+                  + self.body.gravity_torque * smoothed.turn[:, 2, 2])
         yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
             energy, float(energy[0]))))))
         if motion.name in self.orders:
@@ -262,17 +247,13 @@ class Judgement:
         if worst.worst <= self.tolerance:
             return
         text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        first = [(scene, order) for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
-        for scene, order in first:
-            yield Finding('first_order', f'{text}; {scene}: the error falls as dt^{order:.2f}',
-                          order)
-        causes = [fault for fault in dynamics.faults_of(
-            self.body, [motion.told for motion in self.motions], self.dt)
-            if worst.of_start < dynamics.EXPLAINED
-            and not (first and fault.name == 'first_order')]
-        yield from (Finding(fault.name, f'{text}; {fault.evidence}', fault.number)
-                    for fault in causes)
-        if not (first or causes):
-            wrong = '; it turns at other rates from the start on' * (
-                worst.of_start >= dynamics.EXPLAINED)
-            yield Finding('inaccurate', text + wrong, math.degrees(worst.worst))
+        found = [Finding('first_order', f'{scene}: the error falls as dt^{order:.2f}', order)
+                 for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
+        if not worst.slow:
+            found += [one for one in dynamics.faults_of(
+                self.body, [motion.told for motion in self.motions], self.dt)
+                if one.name not in [first.name for first in found]]
+        yield from (one._replace(evidence=f'{text}; {one.evidence}') for one in found)
+        if not found:
+            yield Finding('inaccurate', text + '; it turns at other rates from the start on' * (
+                worst.slow), math.degrees(worst.worst))

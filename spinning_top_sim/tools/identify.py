@@ -31,7 +31,7 @@ HIDDEN = 1e-3           # share of a size in what cannot be told, from which on 
 NEAR = 0.25             # distance of a size from the value that it has for a fault
 SURE = 5.0              # standard deviations from which on a size is not chance
 # Causes count as equally good if they leave at most AS_GOOD times what the best one leaves, or at
-# most AS_GOOD_SHARE of what there was, but no more than the noise.
+# most AS_GOOD_SHARE of what there was, but no more than the noise, or than rounding.
 AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
 # Noise may have this much more power than it seems to have, and that over the root of the rows.
 SAME_POWER, OF_CHANCE = 1.05, 11.0
@@ -154,7 +154,8 @@ def explain(model: Model, causes: Sequence[Cause],
         tried = [fit_of([*chosen, cause]) for cause in others]
         after = [np.inf if judged([*chosen, cause], one)[-1] is None else one.beyond
                  for cause, one in zip(others, tried, strict=True)]
-        good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * fit.beyond, fit.noise or np.inf))
+        good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * fit.beyond, fit.noise or np.inf),
+                   TINY * nothing.beyond)
         # Of equally good causes the one with the fewest effects wins, for more effects always fit
         # better, then the one that is named first.
         _, _, best = min((len(cause.effects), max(left, good / AS_GOOD), k) for k, (

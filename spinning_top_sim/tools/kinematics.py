@@ -207,13 +207,11 @@ def stretches(parts: Parts) -> tuple[list[Stretch], float]:
     for name, (at, rows) in parts.items():
         gaps = np.flatnonzero(np.diff(at) > GAP * intervals[name])
         pieces = [*zip([0, *gaps + 1], [*gaps + 1, len(at)], strict=True)]
-        squares = [(white(rows[a:b], name in ('attitudes', 'positions')) ** 2, b - a)
-                   for a, b in pieces if b - a > 2 * ORDER]
+        squares = [(_noise(name, rows[a:b]) ** 2, b - a) for a, b in pieces if b - a > 2 * ORDER]
         sigma[name] = math.sqrt(sum(one * n for one, n in squares)
                                 / max(sum(n for _, n in squares), 1))
         spans = [(max(first, at[a]), min(last, at[b - 1])) for first, last in spans
                  for a, b in pieces if at[a] < last and at[b - 1] > first]
-    sigma['attitudes'] *= 4.0 / math.sqrt(3.0)      # four components of half an angle
     found, left_out = [], max(at[-1] for at, _ in parts.values()) - min(
         at[0] for at, _ in parts.values())
     for first, last in spans:
@@ -223,10 +221,19 @@ def stretches(parts: Parts) -> tuple[list[Stretch], float]:
         left_out -= last - first
         even: Reals = first + step * np.arange(count, dtype=float)
         values = {name: _at(even, *one) for name, one in parts.items()}
+        # Stamps that are not exact make noise, too.
+        noise = {name: max(one, _noise(name, values[name])) for name, one in sigma.items()}
         rotation = Rotation.from_quat(values.pop('attitudes'))
         positions = values.pop('positions', np.zeros((count, 3)))
-        found.append(Stretch(even, rotation, positions - positions[0], values, sigma, intervals))
+        found.append(Stretch(even, rotation, positions - positions[0], values, noise, intervals))
     return found, left_out if left_out > step else 0.0
+
+
+def _noise(name: str, values: Reals) -> float:
+    """Return the deviation of white noise of a part, of attitudes about each axis [rad]."""
+    # Four components of half an angle.
+    return white(values, name in ('attitudes', 'positions')) * (
+        4.0 / math.sqrt(3.0) if name == 'attitudes' else 1.0)
 
 
 def _at(even: Reals, times: Reals, values: Reals) -> Reals:
