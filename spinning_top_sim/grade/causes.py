@@ -21,19 +21,16 @@ from spinning_top_sim.tools.identify import (
 from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
-# Terms of a specific force: what each is, and the fault where it is missing.
-TERMS = {'tangential': ('a x r', 'no_tangential_term'),
-         'centripetal': ('w x (w x r)', 'no_centripetal_term'),
-         'gravity': ('gravity', 'no_gravity'),
-         'linear': ('the acceleration of the origin', 'no_linear_acceleration'),
-         'lever': ('the lever arm', 'no_lever_arm')}
+# Terms of a specific force, and the fault where one is missing.
+TERMS = {'tangential': 'no_tangential_term', 'centripetal': 'no_centripetal_term',
+         'gravity': 'no_gravity', 'linear': 'no_linear_acceleration', 'lever': 'no_lever_arm'}
 OFFSETS = 'offset 0', 'offset 1', 'offset 2'
 MATRIX = [f'matrix {i}{j} total' for i, j in ENTRIES]
 LATE = 0.75                 # lag from which on it is a fault [samples of the sensor]
 # Share of a reading from which on a discrepancy is strange: rates that are told may be those of
 # the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
-UNEXPLAINED, ROUGH = 0.25, 0.3   # shares of a discrepancy, with noise of a reading, left at most
+UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 MISSING = 0.05              # share of a whole reading that is none
 # By which a size differs from that of a unit, entries from axes, and from a turn, as a share.
@@ -101,25 +98,36 @@ class Causes:
     def find(self) -> tuple[list[Finding], Fit]:
         """Return the faults, and what they leave of the discrepancy."""
         right = self.model.fit([])
-        if unit := [*self._field_unit(right)]:
-            return unit, right
+        if self.kind == 'magnetometer' and self.compared.always:
+            size, (low, high) = float(np.linalg.norm(right.found)), EARTH_FIELD
+            for unit, factor in self.compared.units.items():
+                if not low < size < high and low < size * factor < high:
+                    return [Finding('units', f'the field is {size:.4g}: it is in {unit}, not in '
+                                    'T', 1.0 / factor)], right
         if right.beyond <= self.least:
             return [], right
         found, rest = explain(self.model, [*self._causes(right.beyond)], 0.5 * self.least)
         if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange, 2.0 * rest.noise,
-                             (ROUGH + 2.0 * rest.noise) * self.noisy):
+                             (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
             # Where the terms cannot be seen, as in free fall, noise is.
             return [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
                             'that of the motion', rest.beyond)] * self._clear('total'), rest
         return found, rest
 
     def _causes(self, before: float) -> Iterator[Cause]:
-        if self.kind == 'accelerations':
-            yield from self._causes_of_forces()
+        for name in TERMS if self.kind == 'accelerations' else ():
+            if not self.arms or name in ('gravity', 'linear'):
+                yield Cause([name], partial(self._term, name))
         yield Cause(['total'], lambda found: self._matrix((1.0 + found[-1]) * AXES))
         yield Cause(['step'])
-        if self.kind == 'rates' and before <= self.strange:      # of rates, whose size alone is known as well
+        if self.kind == 'rates' and before <= self.strange:      # their size is known as well
             return
+        if self.kind == 'accelerations':
+            yield Cause(['difference'], _difference)
+            yield Cause(['gravity', 'fixed gravity'], instead(
+                'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
+            arm, judged = ('turned arm', _split_arm) if self.arms else ('arm', self._arm)
+            yield Cause([f'{arm} {k}' for k in range(3)], judged)
         yield Cause(OFFSETS, self._bias)
         for effect, name, text in (
                 ('world', 'rates_in_world' if self.kind in OF_TURNS else 'reading_in_world',
@@ -133,19 +141,46 @@ class Causes:
                          for i, j in ENTRIES],
                         lambda found: self._matrix(AXES + found[-9:].reshape(3, 3)))
 
-    def _causes_of_forces(self) -> Iterator[Cause]:
-        for name in TERMS:
-            if not self.arms or name in ('gravity', 'linear'):
-                yield Cause([name], partial(self._term, name))
-        yield Cause(['difference'], self._difference)
-        yield Cause(['gravity', 'fixed gravity'], instead(
-            'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
-        arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
-        yield Cause([f'{arm} {k}' for k in range(3)], judged)
-
     def _clear(self, name: str) -> bool:
         """Return whether an effect is much larger than its noise."""
         return not self.noisy or self.model.clear(name, CLEARLY)
+
+    def _term(self, term: str, found: Reals) -> Finding | None:
+        """Judge the size of a term."""
+        share = 1.0 + float(found[-1])
+        text = f'the term {term} has {share:.3g} times its size'
+        # A term of noise seems to be missing; gravity is in g where the whole reading is.
+        if not self._clear(term) or abs(share * STANDARD_GRAVITY - 1.0) < OF_UNIT:
+            return None
+        if abs(share) < NEAR:
+            return Finding(TERMS[term], text, share)
+        if share < 0.0:
+            return Finding('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
+        if term == 'gravity':
+            return Finding('gravity' * (abs(share - 1.0) > GRAVITY_BAND), text, share)
+        # Noise that is not white makes it smaller.
+        return Finding('acceleration_scale' * (not self.noisy), text, share)
+
+    def _arm(self, found: Reals) -> Finding | None:
+        """Judge where the IMU is."""
+        arm, point = self.compared.arm, found[-3:] + self.compared.arm
+        share = float(point @ arm) / (float(arm @ arm) or 1.0)
+        if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * np.linalg.norm(point):
+            return self._term('lever', np.array([share - 1.0]))
+        return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
+                       f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
+
+    def _bias(self, found: Reals) -> Finding | None:
+        offset = found[-3:]
+        if self.kind == 'magnetometer' and self.compared.always and (
+                np.linalg.norm(found[:3]) < NEAR * np.linalg.norm(offset)):
+            return None                         # the field does not turn with the IMU
+        # Where w x (w x r) is not known its mean seems to be a bias.
+        coarse = self.noisy and self.kind == 'accelerations' and SURE * (
+            self.model.fit(['centripetal']).sigma[-1]) > TELLS
+        return NO_FAULT if coarse else Finding(
+            'bias', f'a constant ({listed(offset)}) {next(iter(self.compared.units))} is added',
+            float(np.linalg.norm(offset)))
 
     def _matrix(self, matrix: Reals) -> Finding | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
@@ -155,7 +190,7 @@ class Causes:
                             for times in (1.0 / factor, factor)
                             if factor != 1.0 and abs(size / times - 1.0) < OF_UNIT), ('', 1.0))
         shape, change = matrix / times, float(np.max(np.abs(matrix - AXES)))
-        axes = np.rint(shape)
+        axes, (left, _, right) = np.rint(shape), np.linalg.svd(shape)
         if np.array_equal(axes @ axes.T, AXES) and np.max(np.abs(shape - axes)) < OF_AXES and (
                 unit or not np.array_equal(axes, AXES)):
             words = ', '.join(f'{axis} reads {one}' for axis, one in zip(
@@ -167,12 +202,11 @@ class Causes:
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             name, small = ('rates_scale', self.least) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
-            return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
-                           'what they should be', matrix[0, 0]) if size > MISSING else None
-        left, _, right = np.linalg.svd(shape)
+            return Finding(name * (change > small), f'the readings are {size:.4g} times '
+                           'what they should be', size) if size > MISSING else None
         turn = left @ right
         if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
-                0.02, OF_TURN * change):
+                OF_UNIT, OF_TURN * change):
             vector = Rotation.from_matrix(turn).inv().as_rotvec()
             angle = float(np.linalg.norm(vector))
             return Finding('mounting' * (angle > self.strange), 'the readings are in axes that '
@@ -184,95 +218,47 @@ class Causes:
         return Finding('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
                        'times what they should be', change)
 
-    def _bias(self, found: Reals) -> Finding | None:
-        offset = found[-3:]
-        if self.kind == 'magnetometer' and len(found) > 3 and (
-                np.linalg.norm(found[:3]) < NEAR * np.linalg.norm(offset)):
-            return None                         # the field does not turn with the IMU
-        # Where w x (w x r) is not known its mean seems to be a bias.
-        coarse = self.noisy and self.kind == 'accelerations' and SURE * (
-            self.model.fit(['centripetal']).sigma[-1]) > TELLS
-        return NO_FAULT if coarse else Finding(
-            'bias', f'a constant ({listed(offset)}) {next(iter(self.compared.units))} is added',
-            float(np.linalg.norm(offset)))
 
-    def _field_unit(self, right: Fit) -> Iterator[Finding]:
-        """Yield the unit of a field that is not known, if it is not that of the Earth in T."""
-        size, (low, high) = float(np.linalg.norm(right.found)), EARTH_FIELD
-        if self.kind == 'magnetometer' and self.compared.always and not low < size < high:
-            for unit, factor in self.compared.units.items():
-                if low < size * factor < high:
-                    yield Finding('units', f'the field is {size:.4g}: it is in {unit}, not in T',
-                                  1.0 / factor)
+def _difference(found: Reals) -> Finding | None:
+    delay = -float(found[-1])
+    return Finding('finite_differences', 'the acceleration, without gravity, is that of '
+                   f'{delay:.3g} steps before, as a difference of two velocities',
+                   delay) if 0.25 < delay < 0.8 else None
 
-    def _term(self, term: str, found: Reals) -> Finding | None:
-        share, (what, missing) = 1.0 + float(found[-1]), TERMS[term]
-        text = f'the term of {what} has {share:.3g} times its size'
-        # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self._clear(term) or (
-                term != 'linear' and abs(share * STANDARD_GRAVITY - 1.0) < OF_UNIT):
-            return None
-        if term == 'gravity' and share > NEAR:
-            return Finding('gravity' * (abs(share - 1.0) > GRAVITY_BAND), text, share)
-        if abs(share) < NEAR:
-            return Finding(missing, text, share)
-        if share > 0.0:                 # noise that is not white makes it smaller
-            return Finding('acceleration_scale' * (not self.noisy), text, share)
-        return Finding('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
 
-    def _difference(self, found: Reals) -> Finding | None:
-        delay = -float(found[-1])
-        return None if not 0.25 < delay < 0.8 else Finding(
-            'finite_differences', f'the acceleration, without gravity, is that of {delay:.3g} '
-            'steps before, as a difference of two velocities', delay)
-
-    def _arm(self, found: Reals) -> Finding | None:
-        arm, point = self.compared.arm, found[-3:] + self.compared.arm
-        share = float(point @ arm) / (float(arm @ arm) or 1.0)
-        if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * np.linalg.norm(point):
-            return self._term('lever', np.array([share - 1.0]))
-        return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
-                       f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
-
-    def _split_arm(self, found: Reals) -> Finding | None:
-        """Judge by the arms that a x r and w x (w x r) have, where none is given."""
-        sizes = np.linalg.norm(found[:3]), np.linalg.norm(found[:3] + found[-3:])
-        for (small, large), term in ((sizes, 'centripetal'), (sizes[::-1], 'tangential')):
-            if small < NEAR * large:
-                share, (what, missing) = float(small / large), TERMS[term]
-                return Finding(missing, f'the term of {what} has {share:.3g} times its size', share)
-        return None
+def _split_arm(found: Reals) -> Finding | None:
+    """Judge by the arms that a x r and w x (w x r) have, where none is given."""
+    sizes = np.linalg.norm(found[:3] + found[-3:]), np.linalg.norm(found[:3])
+    shares = (sizes / np.max(sizes)).tolist()
+    return next((Finding(TERMS[term], f'the term {term} has {share:.3g} times its size', share)
+                 for term, share in zip(TERMS, shares) if share < NEAR), None)
 
 
 def _estimates(compared: Comparison, model: Model) -> dict[str, Mark]:
     """Return what the sensor is found to be, with intervals of 95 %."""
-    always, marks = compared.always, {}
-
-    def add(names: Sequence[str], right: Reals, effects: Sequence[str]) -> None:
+    kind, unknown, marks = compared.kind, 3 * bool(compared.always), {}
+    for prefix, names, right, effects in (
+            ('field_' if kind == 'magnetometer' else 'lever_arm_', 'xyz'[:unknown],
+             np.zeros(unknown), []),
+            (f'{kind}_', [*(f'matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES),
+                          *(f'bias_{axis}' for axis in 'xyz')] * (kind in DENSITIES),
+             np.append(AXES, np.zeros(3)), [*MATRIX, *OFFSETS])):
         fit = model.fit(effects)
-        own = len(fit.found) - len(right)
-        marks.update({name: Mark(float(value), meaning=_interval(sigma)) for name, value, sigma
-                      in zip(names, right + fit.found[own:], fit.sigma[own:], strict=True)
-                      if math.isfinite(sigma)})
-
-    what = 'field' if compared.kind == 'magnetometer' else 'lever_arm'
-    add([f'{what}_{axis}' for axis in 'xyz'[:len(always)]], np.zeros(len(always)), [])
-    if compared.kind in DENSITIES:
-        add([f'{compared.kind}_matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES]
-            + [f'{compared.kind}_bias_{axis}' for axis in 'xyz'],
-            np.append(AXES.ravel(), np.zeros(3)), [*MATRIX, *OFFSETS])
+        for name, value, sigma in zip(names, right + fit.found[-len(right):],
+                                      fit.sigma[-len(right):], strict=False):
+            if math.isfinite(sigma):
+                marks[prefix + name] = Mark(float(value), meaning=_interval(sigma))
     return marks
 
 
 def _untold(compared: Comparison, model: Model) -> Iterator[str]:
     """Yield what cannot be told of the readings, and the poses that could tell it."""
-    terms = [name for name in (('total',) if compared.kind in OF_TURNS else ('centripetal', 'linear'))
-             if name in model.names and model.size(name) > 0.0]
     turns, places = (max(one.body.sigma.get(name, 0.0) for one, _ in compared.motions)
                      for name in ('attitudes', 'positions'))
-    for name in terms:
+    for name in {'accelerations': ('centripetal', 'linear'), 'magnetometer': ()}.get(
+            compared.kind, ('total',)):
         sigma = float(model.fit([name]).sigma[-1])
-        if (worse := SURE * sigma / TELLS) > 1.0:
+        if (worse := SURE * sigma / TELLS) > 1.0 and model.clear(name, 1.5):
             yield (f'{compared.kind}: the size of the term {name} is known to '
                    f'+- {196.0 * sigma:.2g} % only' + (
                        f'; poses with noise of {turns / worse:.2g} rad, {places / worse:.2g} m '
