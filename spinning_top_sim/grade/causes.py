@@ -9,6 +9,7 @@ possible explain what a right reading does not, and are named by the sizes of th
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,7 +36,6 @@ CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 MISSING = 0.05              # share of a whole reading that is none
 # By which a size differs from that of a unit, entries from axes, and from a turn, as a share.
 OF_UNIT, OF_AXES, OF_TURN = 0.02, 0.1, 0.3
-SANE = 0.5                  # by which the matrix of a sensor may differ from the identity
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
 NOISE_BAND, OF_CHANCE = 0.05, 5.7   # by which noise may differ from what is declared
@@ -64,7 +64,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
                                       'the acceleration of the origin, without positions'])
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
              f'{kind}_discrepancy': Mark(model.fit([]).beyond),
-             f'{kind}_noise': Mark(compared.reading_noise), **_estimates(compared, model)}
+             f'{kind}_noise': Mark(compared.reading_noise), **dict(_estimates(kind, model))}
     if kind in DENSITIES and not found:         # beside a fault the noise is not known
         found = [*_noise_faults(compared, model, rest, getattr(imu, DENSITIES[kind]))]
     if clear and abs(late) > max(LATE, SURE * sigma):
@@ -202,8 +202,8 @@ class Causes:
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             name, small = ('rates_scale', self.least) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
-            return Finding(name * (change > small), f'the readings are {size:.4g} times '
-                           'what they should be', size) if size > MISSING else None
+            return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
+                           'what they should be', matrix[0, 0]) if size > MISSING else None
         turn = left @ right
         if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
                 OF_UNIT, OF_TURN * change):
@@ -234,21 +234,21 @@ def _split_arm(found: Reals) -> Finding | None:
                  for term, share in zip(TERMS, shares) if share < NEAR), None)
 
 
-def _estimates(compared: Comparison, model: Model) -> dict[str, Mark]:
-    """Return what the sensor is found to be, with intervals of 95 %."""
-    kind, unknown, marks = compared.kind, 3 * bool(compared.always), {}
-    for prefix, names, right, effects in (
-            ('field_' if kind == 'magnetometer' else 'lever_arm_', 'xyz'[:unknown],
-             np.zeros(unknown), []),
-            (f'{kind}_', [*(f'matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES),
-                          *(f'bias_{axis}' for axis in 'xyz')] * (kind in DENSITIES),
-             np.append(AXES, np.zeros(3)), [*MATRIX, *OFFSETS])):
-        fit = model.fit(effects)
-        for name, value, sigma in zip(names, right + fit.found[-len(right):],
-                                      fit.sigma[-len(right):], strict=False):
+def _estimates(kind: str, model: Model) -> Iterator[tuple[str, Mark]]:
+    """Yield what the sensor is found to be, with intervals of 95 %."""
+    def told(names: Sequence[str], right: Reals, effects: Sequence[str]) -> Iterator[Any]:
+        fit, own = model.fit(effects), slice(-len(names), None)
+        for name, value, sigma in zip(names, right + fit.found[own], fit.sigma[own], strict=True):
             if math.isfinite(sigma):
-                marks[prefix + name] = Mark(float(value), meaning=_interval(sigma))
-    return marks
+                yield name, Mark(float(value), meaning=_interval(sigma))
+
+    if model.always:
+        what = 'field' if kind == 'magnetometer' else 'lever_arm'
+        yield from told([f'{what}_{axis}' for axis in 'xyz'], np.zeros(3), [])
+    if kind in DENSITIES:
+        yield from told([*(f'{kind}_matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES),
+                         *(f'{kind}_bias_{axis}' for axis in 'xyz')],
+                        np.append(AXES, np.zeros(3)), [*MATRIX, *OFFSETS])
 
 
 def _untold(compared: Comparison, model: Model) -> Iterator[str]:
