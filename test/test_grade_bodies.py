@@ -154,5 +154,5 @@ def test_held_poses_are_told_and_nothing_is_graded_beside_them():
 def test_a_body_that_rests_is_not_held():
     moving = np.cumsum(np.full((600, 3), 0.01), axis=0)
     resting = np.concatenate((moving, np.repeat(moving[-1:], 400, axis=0), moving + 9.0))
-    assert held('gyroscope', resting)[1] is None
-    assert held('gyroscope', np.repeat(moving, 2, axis=0))[1].number == 2.0
+    assert not held('gyroscope', resting)[1]
+    assert held('gyroscope', np.repeat(moving, 2, axis=0))[1][0].number == 2.0

@@ -39,21 +39,18 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     subject : str
         Name of what is graded.
     """
-    imu, parts, faults = imu or Imu(), dict(parts), list[Finding]()
-    for name, (times, values) in parts.items():
-        new, hold = held(name, values)
-        if hold and name not in READINGS:
-            return Report(subject, hold, unjudged=['readings, beside held poses'])
-        faults += hold
-        parts[name] = (times[new], values[new]) if hold else (times, values)
-    bodies, left_out = stretches(parts)
-    notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] if left_out else []
-    if not bodies:
-        return Report(subject, faults, {}, notes, unjudged=[
-            'readings: no part without a gap is long enough'])
-    if any(body.coarse for body in bodies):
-        return Report(subject, faults, {}, notes, unjudged=[
-            f'readings: the body turns by more than {MOST:g} rad between two samples'])
+    imu, new = imu or Imu(), {name: held(name, values) for name, (_, values) in parts.items()}
+    faults = [fault for _, found in new.values() for fault in found]
+    bodies, left_out = stretches({name: (times[new[name][0]], values[new[name][0]])
+                                  if new[name][1] else (times, values)
+                                  for name, (times, values) in parts.items()})
+    notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] * bool(left_out > 0.0)
+    why = ('beside held poses' if any(new[name][1] for name in new.keys() - READINGS.keys()) else
+           'no part without a gap is long enough' if not bodies else
+           f'the body turns by more than {MOST:g} rad between two samples'
+           if any(body.coarse for body in bodies) else '')
+    if why:
+        return Report(subject, faults, {}, notes, unjudged=[f'readings: {why}'])
     convention = convention_of(bodies, imu, gravity)
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
@@ -67,7 +64,7 @@ def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:
     """Return which rows (n, k) are not those before, and the fault if each is told again."""
     new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
     runs = np.diff(np.flatnonzero(new))
-    usual = runs[np.abs(runs - np.median(runs)) < 1.0] if len(runs) >= HELD_RUNS else runs[:0]
+    usual = runs[np.abs(runs - np.median(runs)) <= 1.0] if len(runs) >= HELD_RUNS else runs[:0]
     # Others are longer: the body rests.
     count = float(np.mean(usual)) if len(usual) > HELD_SHARE * len(runs) else 1.0
     return new, [Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
@@ -80,10 +77,11 @@ def undone(body: Stretch, convention: Convention) -> Stretch:
                    positions=Rotation.from_quat(convention.world).inv().apply(body.positions))
 
 
-def _turned(one: Convention) -> bool:
-    """Return whether a world with the same z is turned: the same as other axes of the sensor."""
+def _of_sensor(one: Convention) -> bool:
+    """Return whether a convention is, but for a turn about z of the world, axes of the sensor."""
     turn = Rotation.from_quat(one.world)
-    return bool(turn.magnitude() > 0.1 and turn.apply(UP)[2] > 0.9 and not one.conjugate)
+    return any(part.startswith('sensor') for part in one.parts) or bool(
+        turn.magnitude() > 0.1 and turn.apply(UP)[2] > 0.9 and not one.conjugate)
 
 
 def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Convention:
@@ -92,14 +90,12 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
 
     Axes of the sensor are left to the readings, and a z that is down to the sign of gravity.
     """
-    ours, *others = (one for one in conventions.group() if not (
-        any(part.startswith('sensor') for part in one.parts) or _turned(one)))
+    ours, *others = (one for one in conventions.group() if not _of_sensor(one))
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
     count = min(int(np.clip(EXCERPT_S / body.step, *SAMPLES)), len(angles) - 1)
     first = int(np.argmax(angles[count:] - angles[:-count]))
     body = body.part(slice(first, first + count))       # in which it turns the most
-
     # No convention changes how fast quaternions change, and so none the noise in rates.
     widths = {name: [compared.motions[0][0].width] for name in ('gyroscope', 'accelerations')
               if (compared := Comparison(name, [body], imu, gravity)).motions}
@@ -108,15 +104,14 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
         """Return the largest share of a reading that is not right in any unit, or one > most."""
         told, worst = undone(body, convention), 0.0
         for name, width in widths.items():
-            compared = Comparison(name, [told], imu, sign * gravity, width)
-            model = compared.model(0)
-            fit = model.fit(['total', *OFFSETS])
-            size = 1.0 + fit.found[len(compared.always)]
-            right = not model.clear('total', CLEARLY) or any(
-                abs(size * unit - 1.0) < 0.1 for unit in compared.units.values())
-            worst = max(worst, fit.beyond if right else 1.0)
-            if worst > most:
-                break
+            if worst <= most:
+                compared = Comparison(name, [told], imu, sign * gravity, width)
+                model = compared.model(0)
+                fit = model.fit(['total', *OFFSETS])
+                size = 1.0 + fit.found[len(compared.always)]
+                right = not model.clear('total', CLEARLY) or any(
+                    abs(size * unit - 1.0) < 0.1 for unit in compared.units.values())
+                worst = max(worst, fit.beyond if right else 1.0)
         return worst
 
     before = left(ours)

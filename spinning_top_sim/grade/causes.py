@@ -190,7 +190,7 @@ class Causes:
                             for times in (1.0 / factor, factor)
                             if factor != 1.0 and abs(size / times - 1.0) < OF_UNIT), ('', 1.0))
         shape, change = matrix / times, float(np.max(np.abs(matrix - AXES)))
-        axes, (left, _, right) = np.rint(shape), np.linalg.svd(shape)
+        axes = np.rint(shape)
         if np.array_equal(axes @ axes.T, AXES) and np.max(np.abs(shape - axes)) < OF_AXES and (
                 unit or not np.array_equal(axes, AXES)):
             words = ', '.join(f'{axis} reads {one}' for axis, one in zip(
@@ -204,6 +204,7 @@ class Causes:
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
             return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
                            'what they should be', matrix[0, 0]) if size > MISSING else None
+        left, _, right = np.linalg.svd(shape)
         turn = left @ right
         if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
                 OF_UNIT, OF_TURN * change):
@@ -212,7 +213,7 @@ class Causes:
             return Finding('mounting' * (angle > self.strange), 'the readings are in axes that '
                            f'are turned by ({listed(vector)}) rad from those of the IMU{unit}',
                            angle)
-        if change > SANE and self.compared.always:    # beside an arm it fits what it is not
+        if self.noisy and self.arms:    # with so many effects noise makes one
             return None
         rows = '; '.join(map(listed, matrix))
         return Finding('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
@@ -231,7 +232,7 @@ def _split_arm(found: Reals) -> Finding | None:
     sizes = np.linalg.norm(found[:3] + found[-3:]), np.linalg.norm(found[:3])
     shares = (sizes / np.max(sizes)).tolist()
     return next((Finding(TERMS[term], f'the term {term} has {share:.3g} times its size', share)
-                 for term, share in zip(TERMS, shares) if share < NEAR), None)
+                 for term, share in zip(TERMS, shares, strict=False) if share < NEAR), None)
 
 
 def _estimates(kind: str, model: Model) -> Iterator[tuple[str, Mark]]:

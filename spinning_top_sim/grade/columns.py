@@ -44,24 +44,14 @@ DENSITIES = {'gyroscope': 'gyroscope_noise_density',
 @dataclass(frozen=True, kw_only=True)
 class Imu:
     """
-    An IMU on a body, as far as it is known.
+    An IMU on a body, as far as it is known.  ValueError names a field that is not allowed.
 
-    Parameters
-    ----------
-    lever_arm : (3,) float, optional
-        Position of the IMU in the body frame [m]; None: not known.
-    mounting : (4,) float
-        q(body <- IMU) as x, y, z, w.
-    field : (3,) float, optional
-        Magnetic field in the world [T]; None: not known.
-    gyroscope_noise_density, accelerometer_noise_density : float, optional
-        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
-        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
-
-    Raises
-    ------
-    ValueError
-        Naming the field, its value and what is allowed.
+    lever_arm : (3,) position of the IMU in the body frame [m]; None: not known
+    mounting : (4,) q(body <- IMU) as x, y, z, w
+    field : (3,) magnetic field in the world [T]; None: not known
+    gyroscope_noise_density, accelerometer_noise_density : of white noise [rad/s/sqrt(Hz)],
+        [m/s^2/sqrt(Hz)]: a sample has the density over sqrt(interval between the samples) as its
+        standard deviation.  0: no noise; None: unknown
     """
 
     lever_arm: tuple[float, float, float] | None = None
@@ -72,10 +62,9 @@ class Imu:
 
     def __post_init__(self) -> None:
         for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
-            value = np.asarray(getattr(self, name) or (0.0,) * length, dtype=float)
-            if value.shape != (length,) or not np.all(np.isfinite(value)):
-                raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
-                                 'numbers')
+            value = getattr(self, name) or (0.0,) * length
+            if np.shape(value) != (length,) or not np.all(np.isfinite(value)):
+                raise ValueError(f'{name} = {value!r}: must be {length} finite numbers')
         if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
             raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
 

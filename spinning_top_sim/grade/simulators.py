@@ -53,10 +53,8 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
     dt : float
         The step [s].  Samples are dt apart, also where the order of convergence is measured with
         smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
-    body : Body
-        The top and the IMU on it.
-    scenes : sequence of Scene
-        Motions to run.
+    body, scenes : Body, sequence of Scene
+        The top with an IMU, and its motions.
     seed : int
         Determines how the top is turned at the start.
     tolerance : float
@@ -66,9 +64,7 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
 
     Raises
     ------
-    TypeError
-        If `run` cannot be called.
-    ValueError
+    TypeError, ValueError
         Naming the argument, its value and what is allowed.
     """
     if not callable(run):
@@ -303,7 +299,7 @@ def _terms(body: Body, motion: Stretch, dt: float) -> dict[str, Reals]:
              'damping': -w * (1.0, 1.0, 0.0), 'axis damping': -w * AXES[2],
              **{f'arm {k}': arm for k, arm in enumerate(arms)},
              **{f'euler {k}': term for k, term in enumerate(euler)}}
-    effects: dict[str, Reals] = {name: sum(weight * node[at:len(node) - 5 + at] for at, weight in enumerate(_MEAN))
+    effects = {name: np.tensordot(_MEAN, [node[at:len(node) - 5 + at] for at in range(6)], 1)
                for name, node in nodes.items()}
     for name in ('gyroscopic', 'gravity'):
         effects[f'{name} step'] = dt / step * np.diff(nodes[name], axis=0)[2:-2]
