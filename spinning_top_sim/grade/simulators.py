@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.bodies import held
-from spinning_top_sim.grade.causes import GRAVITY_BAND, judge, listed
+from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, judge, listed
 from spinning_top_sim.grade.columns import AXES, KINDS, NORM, READINGS, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.states import relative_drift
@@ -28,7 +28,7 @@ Simulate = Callable[[Body, Start, Reals, float], Any]
 TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
 WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
-SLOW = 0.25             # share of an error that follows from wrong rates from the start on
+SAME = 0.1              # share of an error that another time leaves
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
@@ -130,13 +130,15 @@ class Motion:
     What is told of a motion.
 
     worst : its largest angle to the exact attitudes [rad]
-    slow : whether that follows from wrong rates in the first step
+    slow : whether it is the right motion at another rate, at first
+    order : p of errors ~ dt^p
     """
 
     name: str
     told: Stretch
     worst: float
-    slow: bool = False
+    slow: bool
+    order: float = math.nan
 
 
 class Judgement:
@@ -146,7 +148,6 @@ class Judgement:
         self.body, self.dt, self.tolerance = body, dt, tolerance
         self.motions: list[Motion] = []
         self.faults: list[Finding] = []
-        self.orders: dict[str, float] = {}
 
     def run(self, run: Simulate, scene: Scene, start: Start) -> None:
         """Add the motion of a scene.  Raises ValueError."""
@@ -168,46 +169,34 @@ class Judgement:
         same = [self.beside_truth(scene.name, start, one) for one in told]
         self.motions.append(same[0])
         errors = [one.worst for one in same]
-        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding: errors ~ dt^p
-            self.orders[scene.name] = -float(np.polyfit(
-                np.log(scene.divided), np.log(errors), 1)[0])
+        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding
+            same[0].order = -float(np.polyfit(np.log(scene.divided), np.log(errors), 1)[0])
 
     def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
         solution = ExactSolution(self.body, start)
-
-        def errors_of(told: Stretch, late: int = 0) -> Reals:
-            truth = solution.states_at_seconds(told.t - late * self.dt).quaternion
-            return (Rotation.from_quat(truth).inv() * told.rotation).magnitude()
-
-        errors = errors_of(told)
-        error = float(np.max(errors[:EARLY]))
-        for late in (-1, 1) if error > min(WRONG, 2.0 * self.tolerance) else ():
-            other = errors_of(told, late)
-            if np.max(other[:EARLY]) < RIGHT * error:
-                self.faults.append(Finding(
-                    'late' if late > 0 else 'early', f'{name}: the attitudes are those of '
-                    f'one step {"before" if late > 0 else "after"}', float(late)))
-                return Motion(name, told, float(np.max(other)))
-        if error > WRONG:
-            q = told.rotation.as_quat()
-            found = conventions.best(q[:EARLY], solution.states_at_seconds(
-                told.t[:EARLY]).quaternion)
-            if found.convention.parts and found.after < RIGHT * found.before:
-                self.faults.append(Finding(
-                    'convention', f'{name}: attitudes are told as {found.convention.name}; '
-                    'this is undone', found.before))
-                told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
-                errors = errors_of(told)
-        # Rates of the first step, which may be those of its beginning or of its end.
-        truth = solution.states_at_seconds(told.t[:2])
-        turned, right = (float((turn[0].inv() * turn[1]).magnitude()) / self.dt
-                         for turn in (told.rotation, Rotation.from_quat(truth.quaternion)))
-        w, change = truth.angular_velocity[0], self.dt * truth.angular_acceleration[0]
-        doubt = abs(float(w @ change)) / (float(np.linalg.norm(w)) or 1.0)
-        at = int(np.argmax(errors >= 0.5 * np.max(errors)))
-        return Motion(name, told, float(np.max(errors)), (
-            abs(turned - right) - doubt) * float(told.t[at]) > SLOW * float(errors[at]))
+        truth = solution.states_at_seconds(told.t)
+        q, exact = told.rotation.as_quat(), Rotation.from_quat(truth.quaternion)
+        found = conventions.best(q[:EARLY], truth.quaternion[:EARLY]) if np.max(
+            (exact.inv() * told.rotation).magnitude()[:EARLY]) > WRONG else None
+        if found and found.convention.parts and found.after < RIGHT * found.before:
+            self.faults.append(Finding('convention', f'{name}: attitudes are told as '
+                                       f'{found.convention.name}; this is undone', found.before))
+            told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
+        # A lag and another rate of the clock turn about the rates.
+        errors, w = (exact.inv() * told.rotation).as_rotvec(), truth.angular_velocity[:EARLY]
+        model = Model({TARGET: errors[:EARLY], 'late': -self.dt * w,
+                       'slow': told.t[:EARLY, np.newaxis] * w})
+        fit = model.fit(['late', 'slow'])
+        late, explained = float(fit.found[0]), fit.rest < SAME * model.size(TARGET)
+        if explained and abs(late) > LATE:
+            self.faults.append(Finding(
+                'late' if late > 0.0 else 'early', f'{name}: the attitudes are those of '
+                f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
+            exact = Rotation.from_quat(solution.states_at_seconds(
+                told.t - late * self.dt).quaternion)
+        return Motion(name, told, float(np.max((exact.inv() * told.rotation).magnitude())),
+                      explained and abs(late) < LATE)
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
@@ -241,16 +230,15 @@ class Judgement:
                   + self.body.gravity_torque * smoothed.turn[:, 2, 2])
         yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
             energy, float(energy[0]))))))
-        if motion.name in self.orders:
-            yield f'order: {motion.name}', Mark(self.orders[motion.name])
+        yield f'order: {motion.name}', Mark(motion.order)
 
     def _of_motions(self) -> Iterator[Finding]:
         worst = max(self.motions, key=lambda motion: motion.worst)
         if worst.worst <= self.tolerance:
             return
         text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        found = [Finding('first_order', f'{scene}: the error falls as dt^{order:.2f}', order)
-                 for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
+        found = [Finding('first_order', f'{one.name}: the error falls as dt^{one.order:.2f}',
+                         one.order) for one in self.motions if 0.5 < one.order < 1.5][:1]
         if not worst.slow:
             found += [one for one in _equations(
                 self.body, [motion.told for motion in self.motions], self.dt)

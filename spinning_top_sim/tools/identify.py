@@ -115,17 +115,17 @@ class Model:
         inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
         found = inverse @ right[:-1, -1]
         left = np.append(-found, 1.0)
-        rest, of_noise = (float(max(left @ one @ left, 0.0)) for one in (products, noise))
+        rest, of_noise = (max(float(left @ one @ left), 0.0) for one in (products, noise))
         # The deviations are those of the rest in blocks, whose noise may be correlated in time.
         scores = (self.blocks[(slice(None), *square)] / np.outer(size, size) @ left)[:, :-1]
         scores = inverse @ (scores - scores.mean(axis=0)).T
         variance = np.maximum(np.sum(scores ** 2, axis=1), np.diag(inverse) * rest / self.count)
         hidden = np.any(np.abs(vectors[:, ~known]) > HIDDEN, axis=1)
-        scale = size[-1] / size[:-1]
+        scale, target = size[-1] / size[:-1], float(size[-1])
         power = SAME_POWER + OF_CHANCE / math.sqrt(self.count)
         return Fit(found * scale, np.where(hidden, np.inf, np.sqrt(variance)) * scale,
-                   size[-1] * math.sqrt(rest / self.count),
-                   size[-1] * math.sqrt(power * of_noise / self.count))
+                   target * math.sqrt(rest / self.count),
+                   target * math.sqrt(power * of_noise / self.count))
 
 
 def explain(model: Model, causes: Sequence[Cause],
