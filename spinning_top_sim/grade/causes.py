@@ -28,8 +28,8 @@ TERMS = {'tangential': 'no_tangential_term', 'centripetal': 'no_centripetal_term
 OFFSETS = 'offset 0', 'offset 1', 'offset 2'
 MATRIX = [f'matrix {i}{j} total' for i, j in ENTRIES]
 LATE = 0.75                 # lag from which on it is a fault [samples of the sensor]
-# Share of a reading from which on a discrepancy is strange: rates that are told may be those of
-# the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
+# Share of a reading from which on a discrepancy is strange: half a step may be between readings
+# and attitudes; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
@@ -43,13 +43,12 @@ ROUNDING = 1e-4             # share of a reading that is no noise
 TELLS = 0.5                 # uncertainty of a share of a term up to which its fault can be told
 
 
-def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
-          placed: bool = True, slack: float = 0.0) -> Report:
+def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
+          placed: bool = True) -> Report:
     """
     Return what is wrong with the readings of a kind.
 
     placed : whether it is known where the origin of the body is
-    slack : share by which readings may differ, since the motion is known no better
     """
     compared = Comparison(kind, stretches, imu, gravity)
     if not compared.motions:
@@ -58,7 +57,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
     samples, sigma, clear = compared.lag()
     late, sigma = samples * compared.steps, sigma * compared.steps
     model = compared.model(round(samples) if clear else 0)
-    found, rest = Causes(compared, model, placed, slack).find()
+    found, rest = Causes(compared, model, placed).find()
     if kind == 'accelerations' and not placed and rest.beyond > max(STRANGE, 2.0 * rest.noise):
         return Report(kind, unjudged=[f'{kind}: {100.0 * rest.beyond:.3g} % of the reading may be '
                                       'the acceleration of the origin, without positions'])
@@ -88,12 +87,11 @@ def listed(values: Reals) -> str:
 class Causes:
     """What may be wrong with readings; `find` finds what is."""
 
-    def __init__(self, compared: Comparison, model: Model, placed: bool, slack: float) -> None:
+    def __init__(self, compared: Comparison, model: Model, placed: bool) -> None:
         self.compared, self.model, self.placed = compared, model, placed
         self.kind, self.noisy = compared.kind, compared.noisy
         self.arms = [name for name in compared.always if name.startswith('arm')]
-        self.least = STRANGE + slack
-        self.strange = max(self.least, REAL * self.noisy, OF_STEPS * (self.kind == 'rates'))
+        self.strange = max(STRANGE, REAL * self.noisy, OF_STEPS * compared.stepped)
 
     def find(self) -> tuple[list[Finding], Fit]:
         """Return the faults, and what they leave of the discrepancy."""
@@ -104,9 +102,9 @@ class Causes:
                 if not low < size < high and low < size * factor < high:
                     return [Finding('units', f'the field is {size:.4g}: it is in {unit}, not in '
                                     'T', 1.0 / factor)], right
-        if right.beyond <= self.least:
+        if right.beyond <= STRANGE:
             return [], right
-        found, rest = explain(self.model, [*self._causes(right.beyond)], 0.5 * self.least)
+        found, rest = explain(self.model, [*self._causes(right.beyond)], 0.5 * STRANGE)
         if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange, 2.0 * rest.noise,
                              (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
             # Where the terms cannot be seen, as in free fall, noise is.
@@ -200,7 +198,7 @@ class Causes:
                            'sign' if np.array_equal(np.abs(axes), AXES) else 'axes',
                            f'{words}, {size:.4g} times what it should be{unit}', size)
         if np.array_equal(matrix, matrix[0, 0] * AXES):
-            name, small = ('rates_scale', self.least) if self.kind == 'rates' else (
+            name, small = ('rates_scale', STRANGE) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
             return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
                            'what they should be', matrix[0, 0]) if size > MISSING else None

@@ -78,7 +78,8 @@ class Comparison:
     sizes : rms of the readings of each stretch, over which they are compared
     own_step, steps : interval of the sensor [s], and its samples per sample that is compared
     motions : of each stretch, smoothed, and the same with as much noise again; none: too short
-    noisy : whether the noise of the motion counts
+    noisy, stepped : whether the noise of the motion counts; it is that of a simulator, whose rates
+        are not known
     """
 
     def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
@@ -94,6 +95,7 @@ class Comparison:
         self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
+        self.stepped = any(one.rates is None and not one.intervals for one in stretches)
         self.motions, self.noisy = self._clear(stretches, widths)
         if self.always and self.motions and kind == 'accelerations':
             self.arm = self.model(0).fit([]).found

@@ -101,8 +101,17 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
     except (Exception, SystemExit) as error:
         raise ValueError(f'run raises {type(error).__name__}: {one_line(error)}') from error
     said = said if isinstance(said, Mapping) else {'attitudes': said}
-    readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
-                for name in ('attitudes', *KINDS) if said.get(name) is not None}
+    readings: dict[str, Reals] = {}
+    for name in ('attitudes', *KINDS):
+        if said.get(name) is not None:
+            try:
+                readings[name] = values = np.array(said[name], dtype=float)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f'{name}: {error}') from error
+            shape, bad = (len(times), 4 if name == 'attitudes' else 3), np.sum(~np.isfinite(values))
+            if values.shape != shape or bad:
+                raise ValueError(f'{name} has shape {values.shape}, {bad} numbers are not finite: '
+                                 f'must be {shape}, all finite')
     if 'attitudes' not in readings:
         raise ValueError(f'what is returned has {[*said]}: must have attitudes')
     attitudes = readings.pop('attitudes')
@@ -110,18 +119,6 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
         raise ValueError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm must be 1')
     return Stretch(times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
                    {name: white(values, jumps=False) for name, values in readings.items()})
-
-
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
-    """Return an array of this shape.  Raises ValueError."""
-    try:
-        numbers = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f'{name}: {error}') from error
-    if numbers.shape != shape or not np.all(np.isfinite(numbers)):
-        raise ValueError(f'{name} has shape {numbers.shape}, {np.sum(~np.isfinite(numbers))} '
-                         f'numbers are not finite: must be {shape}, all finite')
-    return numbers
 
 
 @dataclass
@@ -215,11 +212,7 @@ class Judgement:
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
-        told = [motion.told for motion in self.motions]
-        # Where no rates are told, half a step may be between readings and attitudes.
-        slack = 0.0 if told[0].rates is not None or kind == 'rates' else max(
-            float(0.5 * (one.rotation[0].inv() * one.rotation[1]).magnitude()) for one in told)
-        return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
+        return judge(kind, [one.told for one in self.motions], self.body, self.body.gravity)
 
     def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
         """Yield the largest error, the relative change of the energy, and the order."""

@@ -49,7 +49,7 @@ def kernel(width: int) -> Reals:
 
 def margin(width: int) -> int:
     """Return how many samples a kernel and a derivative need on each side."""
-    return len(kernel(width)) // 2 + SIDE
+    return 3 * (width - 1) // 2 + SIDE
 
 
 def white(values: Reals, jumps: bool = True) -> float:
@@ -172,8 +172,6 @@ class Smoothed:
             self.smooth[:] = True
 
     def _convolved(self, values: Reals) -> Reals:
-        if self.width == 1:
-            return values
         smooth: Reals = correlate1d(values, kernel(self.width), axis=0)
         return smooth
 
@@ -186,8 +184,6 @@ class Smoothed:
 
     def vector(self, values: Reals) -> Reals:
         """Return vectors in the body (n, 3), smoothed as those of the world are (m, 3)."""
-        if self.width == 1:
-            return values[self.inner]
         return along(self.back, self._convolved(along(self.body.matrices, values))[self.inner])
 
 
