@@ -73,18 +73,18 @@ def test_a_defect_of_the_motion_is_named(name):
         assert report.found[0].number == pytest.approx(NUMBERS[name], rel=1e-3)
 
 
-@pytest.mark.parametrize(('slow', 'rates'), [(0.99, False), (0.999, False), (0.999, True)])
-def test_a_slow_clock_is_no_other_mass(slow, rates):
-    def run(top, start, times, dt):
-        motion = solve(top, start, slow * times)
-        return {'attitudes': motion.quaternion, **(
-            {'rates': motion.angular_velocity} if rates else {})}
+def test_a_slow_clock_is_no_other_mass():
+    for rates in ({}, {'rates': 1.0}):
+        def run(top, start, times, dt, rates=rates):
+            motion = solve(top, start, 0.999 * times)
+            return {'attitudes': motion.quaternion, **{
+                name: motion.angular_velocity for name in rates}}
 
-    report = grade(run, scenes=SHORT[:2])
-    assert report.faults == ['inaccurate'] and 'from the start on' in str(report), report
+        report = grade(run, scenes=SHORT[:2])
+        assert report.faults == ['inaccurate'] and 'from the start on' in str(report), report
 
 
-@pytest.mark.parametrize('size', [1.005, 1.01, 2.0])
+@pytest.mark.parametrize('size', [1.005, 2.0])
 def test_rates_of_another_size_are_named_and_the_gyroscope_is_right(size):
     report = short(Imu(defect=lambda b: {'rates': size * b.w}))
     assert report.faults == ['rates_scale'], report
@@ -102,16 +102,12 @@ def test_what_is_held_is_named_and_the_rest_is_graded():
         assert {*report.faults} == faults, report
 
 
-def test_with_the_step_of_a_game_the_fast_spin_is_left_out():
-    report = grade(Imu(), scenes=SCENES[1:], dt=1.0 / 60.0)
-    assert report.passed, report
-    assert 'total_error_deg: waves' in report.marks and 'not judged: fast spin' in str(report)
-    assert 'total_error_deg: fast spin' not in report.marks
-
-
-def test_a_lever_arm_of_another_length_is_a_scale_in_slow_motions_too():
-    report = grade(Imu(defect='wrong dt'), scenes=SHORT[1:2], dt=0.004)
-    assert report.faults == ['acceleration_scale'], report
+def test_what_is_too_fast_is_left_out_and_what_cannot_be_seen_is_no_fault():
+    report = grade(Imu(), scenes=SCENES[-2:], dt=1.0 / 60.0)
+    assert report.passed and 'not judged: fast spin' in str(report), report
+    for theta, gravity in ((0.0, 9.8), (math.pi, -9.8), (0.0, 0.0)):
+        spin = Scene('spin', {'theta': theta, 'l3': 2.0, 'lz': 2.0 * math.cos(theta)}, 0.5)
+        assert grade(Imu(), body=replace(WHEEL, gravity=gravity), scenes=[spin], dt=0.01).passed
 
 
 def test_without_rates_those_of_the_attitudes_serve():
@@ -149,20 +145,6 @@ def test_samples_that_are_fewer_than_the_steps_show_their_kind():
             return {'attitudes': attitudes, 'rates': rates}
 
         assert grade(run, dt=0.01, scenes=[scene]).faults == faults
-
-
-def test_noise_that_is_not_declared_is_no_fault():
-    def run(top, *given):
-        return Imu(defect='residuals')(SENSOR, *given)
-
-    unknown = {'gyroscope_noise_density': None, 'accelerometer_noise_density': None}
-    assert short(run, replace(WHEEL, **unknown)).passed
-
-
-@pytest.mark.parametrize(('theta', 'gravity'), [(0.0, 9.8), (math.pi, -9.8), (0.0, 0.0)])
-def test_a_top_that_only_spins_shows_no_faults_that_cannot_be_seen(theta, gravity):
-    spin = Scene('spin', {'theta': theta, 'l3': 2.0, 'lz': 2.0 * math.cos(theta)}, 0.5)
-    assert grade(Imu(), body=replace(WHEEL, gravity=gravity), scenes=[spin], dt=0.01).passed
 
 
 def test_all_faults_are_in_the_page_and_no_other():

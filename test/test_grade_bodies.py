@@ -85,20 +85,19 @@ def test_a_lag_that_the_motion_does_not_tell_is_not_told():
 
 def test_what_poses_are_too_coarse_to_tell_is_told_with_the_noise_that_would_do():
     moving = body(4, noisy=False, seconds=20.0, kind='forced', rate=30.0)
-    moving.noise = {'attitudes': 0.02, 'positions': 1e-3}
+    moving.noise = {'attitudes': 0.05, 'positions': 1e-3}
     report = grade_readings(told(moving, 'no centripetal'))
     assert report.passed, report
     assert 'passed' not in str(report) and any(
         'centripetal' in one and 'would tell' in one for one in report.unjudged), report
 
 
-@pytest.mark.parametrize('size', [1.0, 2.0])
-def test_readings_beside_too_few_poses_are_not_judged(size):
+def test_readings_beside_too_few_poses_are_not_judged():
     t = np.arange(0.0, 5.0, 1.0 / 30.0)
     w = np.tile((0.0, 0.0, 80.0), (len(t), 1))
     turn = Rotation.from_rotvec(w * t[:, np.newaxis]) * Rotation.from_euler('x', 0.3)
     report = grade_readings({'attitudes': (t, turn.as_quat()),
-                             'gyroscope': (t, size * turn.inv().apply(w))})
+                             'gyroscope': (t, 2.0 * turn.inv().apply(w))})
     assert report.passed and not report.marks
     assert str(report).startswith('readings: no fault found in what was judged\n  not judged: '
                                   'readings: the body turns by more than 0.7 rad'), report
@@ -144,14 +143,11 @@ def test_a_wrong_sign_of_gravity_and_accelerations_in_the_world_are_no_conventio
         assert grade_readings({**parts, 'accelerations': (moving.t, force)}).faults == [fault]
 
 
-def test_held_poses_are_told_and_nothing_is_graded_beside_them():
+def test_held_poses_are_told_and_a_body_that_rests_is_not_held():
     parts = told(body(1, noisy=False, seconds=4.0, kind='forced', rate=200.0))
     t, q = parts['attitudes']
-    held = q[np.floor(np.arange(len(q)) / 6.667).astype(int) * 20 // 3]
-    assert grade_readings({**parts, 'attitudes': (t, held)}).faults == ['held']
-
-
-def test_a_body_that_rests_is_not_held():
+    repeated = q[np.floor(np.arange(len(q)) / 6.667).astype(int) * 20 // 3]
+    assert grade_readings({**parts, 'attitudes': (t, repeated)}).faults == ['held']
     moving = np.cumsum(np.full((600, 3), 0.01), axis=0)
     resting = np.concatenate((moving, np.repeat(moving[-1:], 400, axis=0), moving + 9.0))
     assert not held('gyroscope', resting)[1]

@@ -4,7 +4,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 GRAVITY = 9.80665
@@ -59,22 +58,15 @@ def forced(t, random, rate):
 
 
 def free(t, random, rate):
-    """Return the same of a free asymmetric body."""
-    inertia = np.array((1.0, random.uniform(1.2, 1.6), random.uniform(1.7, 2.2)))
-    w0 = random.standard_normal(3)
+    """Return the same of a free symmetric body."""
+    w0, turn = random.standard_normal(3), random.uniform(0.4, 0.8)
     w0 *= rate / np.linalg.norm(w0)
-
-    def slope(_, y):
-        w, q = y[:3], y[3:]
-        return np.concatenate((np.cross(inertia * w, w) / inertia, 0.5 * np.array((
-            q[3] * w[0] + q[1] * w[2] - q[2] * w[1], q[3] * w[1] + q[2] * w[0] - q[0] * w[2],
-            q[3] * w[2] + q[0] * w[1] - q[1] * w[0], -q[:3] @ w))))
-
-    q0 = Rotation.random(random_state=int(random.integers(1 << 30))).as_quat()
-    y = solve_ivp(slope, (t[0], t[-1] + 1e-9), [*w0, *q0], 'DOP853', t, rtol=1e-12,
-                  atol=1e-13).y.T
-    w = y[:, :3]
-    return Rotation.from_quat(y[:, 3:]), w, np.cross(inertia * w, w) / inertia
+    # It precesses about its angular momentum, and the rates turn about its axis.
+    about = Rotation.from_rotvec(np.outer(t, (0.0, 0.0, turn * w0[2])))
+    w = about.apply(w0)
+    start = Rotation.random(random_state=int(random.integers(1 << 30)))
+    precession = Rotation.from_rotvec(np.outer(t, start.apply(w0 * (1.0, 1.0, 1.0 + turn))))
+    return precession * start * about.inv(), w, np.cross((0.0, 0.0, turn * w0[2]), w)
 
 
 def body(seed, noisy=None, seconds=20.0, kind=None, rate=None):
