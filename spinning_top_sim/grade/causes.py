@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.columns import (
-    AXES, DENSITIES, ENTRIES, OF_TURNS, STANDARD_GRAVITY, Comparison, Imu)
-from spinning_top_sim.tools import conventions
-from spinning_top_sim.tools.identify import (
-    NEAR, NO_FAULT, SURE, TARGET, Cause, Fit, Model, explain, instead)
+from spinning_top_sim.grade import columns
+from spinning_top_sim.grade.columns import AXES, DENSITIES, ENTRIES, OF_TURNS, Comparison, Imu
+from spinning_top_sim.tools import conventions, identify
+from spinning_top_sim.tools.identify import NEAR, NO_FAULT, SURE, Cause, Fit, Model
 from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
@@ -104,7 +103,7 @@ class Causes:
                                     'T', 1.0 / factor)], right
         if right.beyond <= STRANGE:
             return [], right
-        found, rest = explain(self.model, [*self._causes(right.beyond)], 0.5 * STRANGE)
+        found, rest = identify.explain(self.model, [*self._causes(right.beyond)], 0.5 * STRANGE)
         if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange, 2.0 * rest.noise,
                              (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
             # Where the terms cannot be seen, as in free fall, noise is.
@@ -122,7 +121,7 @@ class Causes:
             return
         if self.kind == 'accelerations':
             yield Cause(['difference'], _difference)
-            yield Cause(['gravity', 'fixed gravity'], instead(
+            yield Cause(['gravity', 'fixed gravity'], identify.instead(
                 'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
             arm, judged = ('turned arm', _split_arm) if self.arms else ('arm', self._arm)
             yield Cause([f'{arm} {k}' for k in range(3)], judged)
@@ -131,8 +130,8 @@ class Causes:
                 ('world', 'rates_in_world' if self.kind in OF_TURNS else 'reading_in_world',
                  'the world, not of the IMU'),
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
-            yield Cause([*(f'in world {arm}' for arm in self.arms), 'total', effect], instead(
-                name, f'the readings are in axes of {text}'))
+            yield Cause([*(f'in world {arm}' for arm in self.arms), 'total', effect],
+                        identify.instead(name, f'the readings are in axes of {text}'))
         # So many effects fit what the origin does, too; of an unknown field they are no product.
         if not self.compared.always or (self.arms and self.placed):
             yield Cause([f'matrix {i}{j} {of}' for of in (*self.arms, 'total')
@@ -148,7 +147,7 @@ class Causes:
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:.3g} times its size'
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self._clear(term) or abs(share * STANDARD_GRAVITY - 1.0) < OF_UNIT:
+        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < OF_UNIT:
             return None
         if abs(share) < NEAR:
             return Finding(TERMS[term], text, share)

@@ -168,15 +168,14 @@ class Comparison:
     def model(self, lag: int) -> Model:
         """Return what readings that are `lag` samples late may contain beside what is right."""
         keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
-        every: tuple[list[dict[str, Reals]], ...] = [], []
+        plain, noisy = list[dict[str, Reals]](), list[dict[str, Reals]]()
         for pair, size in zip(self.motions, self.sizes, strict=True):
             smooth = pair[0].smooth[keep]
-            for motion, parts in zip(pair, every, strict=True):
+            for motion, parts in zip(pair, (plain, noisy), strict=True):
                 effects = self.columns(motion)
                 effects[TARGET] = self.read(motion, lag) - effects['total']
                 parts.append({name: one[keep][smooth] / size for name, one in effects.items()})
-        return Model(*({name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
-                       for parts in every), self.always)
+        return Model(plain, noisy, self.always)
 
     def columns(self, motion: Smoothed) -> dict[str, Reals]:
         """Return the terms of a right reading, their sum `total`, and effects of defects."""

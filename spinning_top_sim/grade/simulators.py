@@ -108,10 +108,10 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
                 readings[name] = values = np.array(said[name], dtype=float)
             except (TypeError, ValueError) as error:
                 raise ValueError(f'{name}: {error}') from error
-            shape, bad = (len(times), 4 if name == 'attitudes' else 3), np.sum(~np.isfinite(values))
-            if values.shape != shape or bad:
-                raise ValueError(f'{name} has shape {values.shape}, {bad} numbers are not finite: '
-                                 f'must be {shape}, all finite')
+            shape, bad = (len(times), 4 if name == 'attitudes' else 3), ~np.isfinite(values)
+            if values.shape != shape or np.any(bad):
+                raise ValueError(f'{name} has shape {values.shape}, {np.sum(bad)} numbers are not '
+                                 f'finite: must be {shape}, all finite')
     if 'attitudes' not in readings:
         raise ValueError(f'what is returned has {[*said]}: must have attitudes')
     attitudes = readings.pop('attitudes')
@@ -182,8 +182,8 @@ class Judgement:
             told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
         # A lag and another rate of the clock turn about the rates.
         errors, w = (exact.inv() * told.rotation).as_rotvec(), truth.angular_velocity[:EARLY]
-        model = Model({TARGET: errors[:EARLY], 'late': -self.dt * w,
-                       'slow': told.t[:EARLY, np.newaxis] * w})
+        model = Model([{TARGET: errors[:EARLY], 'late': -self.dt * w,
+                        'slow': told.t[:EARLY, np.newaxis] * w}])
         fit = model.fit(['late', 'slow'])
         late, explained = float(fit.found[0]), fit.rest < SAME * model.size(TARGET)
         if explained and abs(late) > LATE:
@@ -249,8 +249,7 @@ def _equations(body: Body, motions: Sequence[Stretch], dt: float) -> list[Findin
     The change of rates in each step is compared with what gravity and the gyroscopic term, both of
     the same attitudes and rates, would cause: errors do not add up there.
     """
-    parts = [_terms(body, motion, dt) for motion in motions]
-    model = Model({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    model = Model([_terms(body, motion, dt) for motion in motions])
     if model.size(TARGET) < UNIMPORTANT:
         return []
     found, rest = explain(model, [

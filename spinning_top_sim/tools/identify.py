@@ -77,20 +77,19 @@ class Model:
     """
     Effects and the discrepancy that they may explain, as sums of squares and products.
 
-    effects : values (N, 3) by name, that of TARGET among them
+    parts : of each motion, values (N, 3) of effects by name, and of TARGET
     noisy : the same with as much noise again as there is in them, all of its correlations included
     always : names of effects that are there, of unknown sizes
     """
 
-    def __init__(self, effects: Mapping[str, Reals], noisy: Mapping[str, Reals] | None = None,
-                 always: Sequence[str] = ()) -> None:
-        self.names, self.always = {name: k for k, name in enumerate(effects)}, always
-        rows = np.stack([one.ravel() for one in effects.values()], axis=1)
+    def __init__(self, parts: Sequence[Mapping[str, Reals]],
+                 noisy: Sequence[Mapping[str, Reals]] = (), always: Sequence[str] = ()) -> None:
+        self.names, self.always = {name: k for k, name in enumerate(parts[0])}, always
+        rows, more = (np.concatenate([np.stack([one.ravel() for one in part.values()], axis=1)
+                                      for part in every]) for every in (parts, noisy or parts))
         self.count = len(rows)
         self.blocks = np.stack([part.T @ part for part in np.array_split(rows, BLOCKS)])
-        more = rows - rows if noisy is None else np.stack(
-            [noisy[name].ravel() for name in effects], axis=1) - rows
-        self.products, self.noise = self.blocks.sum(axis=0), more.T @ more
+        self.products, self.noise = self.blocks.sum(axis=0), (more - rows).T @ (more - rows)
 
     def size(self, name: str) -> float:
         """Return the rms of an effect, or of TARGET."""
@@ -117,7 +116,7 @@ class Model:
         left = np.append(-found, 1.0)
         rest, of_noise = (max(float(left @ one @ left), 0.0) for one in (products, noise))
         # The deviations are those of the rest in blocks, whose noise may be correlated in time.
-        scores = (self.blocks[(slice(None), *square)] / np.outer(size, size) @ left)[:, :-1]
+        scores = (self.blocks[np.ix_(range(BLOCKS), at, at)] / np.outer(size, size) @ left)[:, :-1]
         scores = inverse @ (scores - scores.mean(axis=0)).T
         variance = np.maximum(np.sum(scores ** 2, axis=1), np.diag(inverse) * rest / self.count)
         hidden = np.any(np.abs(vectors[:, ~known]) > HIDDEN, axis=1)
