@@ -158,7 +158,7 @@ def test_all_faults_are_in_the_page_and_no_other():
     # Those without a simulator or a body there have a test of their own, or are causes of causes.
     assert {*names} - named == {
         'invalid_output', 'not_deterministic', 'inaccurate', 'early', 'gravity', 'matrix',
-        'no_linear_acceleration', 'no_acceleration'}
+        'no_linear_acceleration'}
 
 
 def at_rest(t):

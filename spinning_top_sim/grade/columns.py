@@ -91,7 +91,8 @@ class Comparison:
                        for k in range(3)] if known is None else []
         self.mounting = Rotation.from_quat((0, 0, 0, 1) if kind == 'rates' else imu.mounting)
         stretches = [one for one in stretches if kind in one.readings]
-        self.sizes = np.array([rms(one.readings[kind]) or 1.0 for one in stretches])
+        sizes = [rms(one.readings[kind]) for one in stretches]
+        self.sizes = np.maximum(sizes, 0.1 * max(sizes, default=0.0) or 1.0)    # one may rest
         self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0

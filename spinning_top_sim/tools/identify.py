@@ -109,8 +109,7 @@ class Model:
                            for one in (self.products, self.noise))
         right = products - noise            # noise in an effect makes it larger than it is
         values, vectors = np.linalg.eigh(right[:-1, :-1])
-        known = values > np.maximum(1e-10, 0.25 * np.sum(
-            vectors * (noise[:-1, :-1] @ vectors), axis=0))
+        known = values > np.maximum(1e-10, np.sum(vectors * (noise[:-1, :-1] @ vectors), axis=0))
         inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
         found = inverse @ right[:-1, -1]
         left = np.append(-found, 1.0)
