@@ -108,7 +108,8 @@ class Causes:
                              (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
             # Where the terms cannot be seen, as in free fall, noise is.
             return [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
-                            'that of the motion', rest.beyond)] * self._clear('total'), rest
+                            'that of the motion', rest.beyond)] * (
+                                self.kind != 'accelerations' or self._clear('total')), rest
         return found, rest
 
     def _causes(self, before: float) -> Iterator[Cause]:
