@@ -123,19 +123,13 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
 
 @dataclass
 class Motion:
-    """
-    What is told of a motion.
-
-    worst : its largest angle to the exact attitudes [rad]
-    slow : whether it is the right motion at another rate, at first
-    order : p of errors ~ dt^p
-    """
+    """What is told of a motion."""
 
     name: str
     told: Stretch
-    worst: float
-    slow: bool
-    order: float = math.nan
+    worst: float                # its largest angle to the exact attitudes [rad]
+    slow: bool                  # whether it is the right motion at another rate, at first
+    order: float = math.nan     # p of errors ~ dt^p
 
 
 class Judgement:

@@ -47,12 +47,8 @@ def forced(t, random, rate):
             sizes * np.sin(speeds * t[:, np.newaxis, np.newaxis] + phases), axis=2))
 
     h = 1e-3
-
-    def turns(k):
-        """Return the turns in k h and in -k h."""
-        return [(turned(t).inv() * turned(t + sign * k * h)).as_rotvec() for sign in (1, -1)]
-
-    (one, less), (two, least) = turns(1), turns(2)
+    one, less, two, least = ((turned(t).inv() * turned(t + k * h)).as_rotvec()
+                             for k in (1, -1, 2, -2))
     return (turned(t), (8.0 * (one - less) - (two - least)) / (12.0 * h),
             (16.0 * (one + less) - (two + least)) / (12.0 * h * h))
 
