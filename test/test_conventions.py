@@ -12,8 +12,6 @@ from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
 TRUTH = Rotation.random(12, random_state=3)
-
-
 NED, NWU = (Rotation.from_matrix(rows) for rows in (
     [(0, 1, 0), (1, 0, 0), (0, 0, -1)], [(0, 1, 0), (-1, 0, 0), (0, 0, 1)]))
 FLIPPED = Rotation.from_euler('x', 180.0, degrees=True)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.bodies import NAMES
-from helpers.faulty_simulators import DEFECTS, MOVED, NOISY, RIGHT, Imu, euler, exact, stepped
+from helpers.faulty_simulators import DEFECTS, MOVED, NOISY, RIGHT, Imu, exact
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +33,7 @@ def short(simulator, body=WHEEL):
     (lambda q: q * (-1.0, -1.0, -1.0, 1.0), ['convention'], 'conjugated'),
     (lambda q: (Rotation.from_euler('x', -90, degrees=True) * Rotation.from_quat(q)).as_quat(),
      ['convention'], 'world'),
-    (lambda q: np.concatenate((q[1:], 2.0 * q[-1:] - q[-2:-1])), ['early'], 'one step after')])
+    (lambda q: np.concatenate((q[1:], 2.0 * q[-1:] - q[-2:-1])), ['early'], 'steps after')])
 def test_the_solution_of_this_package_passes_and_conventions_are_found_at_the_start(
         told, faults, says):
     report = grade(lambda top, start, times, dt: told(solve(top, start, times).quaternion),
@@ -73,18 +73,18 @@ def test_a_defect_of_the_motion_is_named(name):
         assert report.found[0].number == pytest.approx(NUMBERS[name], rel=1e-3)
 
 
-@pytest.mark.parametrize(('slow', 'rates'), [(0.99, False), (0.999, False), (0.999, True)])
-def test_a_slow_clock_is_no_other_mass(slow, rates):
-    def run(top, start, times, dt):
-        motion = solve(top, start, slow * times)
-        return {'attitudes': motion.quaternion, **(
-            {'rates': motion.angular_velocity} if rates else {})}
+def test_a_slow_clock_is_no_other_mass():
+    for names in ((), ('rates',)):
+        def run(top, start, times, dt, names=names):
+            motion = solve(top, start, 0.999 * times)
+            return {'attitudes': motion.quaternion,
+                    **dict.fromkeys(names, motion.angular_velocity)}
 
-    report = grade(run, scenes=SHORT[:2])
-    assert report.faults == ['inaccurate'] and 'from the start on' in str(report), report
+        report = grade(run, scenes=SHORT[:2])
+        assert report.faults == ['inaccurate'] and 'from the start on' in str(report), report
 
 
-@pytest.mark.parametrize('size', [1.005, 1.01, 2.0])
+@pytest.mark.parametrize('size', [1.005, 2.0])
 def test_rates_of_another_size_are_named_and_the_gyroscope_is_right(size):
     report = short(Imu(defect=lambda b: {'rates': size * b.w}))
     assert report.faults == ['rates_scale'], report
@@ -92,26 +92,19 @@ def test_rates_of_another_size_are_named_and_the_gyroscope_is_right(size):
 
 
 def test_what_is_held_is_named_and_the_rest_is_graded():
-    def run(*given, name):
+    def run(*given):
         said = Imu(defect='late')(*given)
-        said[name] = said[name][::2].repeat(2, axis=0)[:len(said[name])]
-        return said
+        return {**said, 'gyroscope': said['gyroscope'][::2].repeat(2, axis=0)[:len(given[2])]}
 
-    for name, faults in (('gyroscope', {'held', 'late'}), ('attitudes', {'held'})):
-        report = short(lambda *given, name=name: run(*given, name=name))
-        assert {*report.faults} == faults, report
+    assert {*short(run).faults} == {'held', 'late'}
 
 
-def test_with_the_step_of_a_game_the_fast_spin_is_left_out():
-    report = grade(Imu(), scenes=SCENES[1:], dt=1.0 / 60.0)
-    assert report.passed, report
-    assert 'total_error_deg: waves' in report.marks and 'not judged: fast spin' in str(report)
-    assert 'total_error_deg: fast spin' not in report.marks
-
-
-def test_a_lever_arm_of_another_length_is_a_scale_in_slow_motions_too():
-    report = grade(Imu(defect='wrong dt'), scenes=SHORT[1:2], dt=0.004)
-    assert report.faults == ['acceleration_scale'], report
+def test_what_is_too_fast_is_left_out_and_what_cannot_be_seen_is_no_fault():
+    report = grade(Imu(), scenes=SCENES[-2:], dt=1.0 / 60.0)
+    assert report.passed and 'not judged: fast spin' in str(report), report
+    for theta, gravity in ((0.0, 9.8), (math.pi, -9.8), (0.0, 0.0)):
+        spin = Scene('spin', {'theta': theta, 'l3': 2.0, 'lz': 2.0 * math.cos(theta)}, 0.5)
+        assert grade(Imu(), body=replace(WHEEL, gravity=gravity), scenes=[spin], dt=0.01).passed
 
 
 def test_without_rates_those_of_the_attitudes_serve():
@@ -140,31 +133,6 @@ def test_what_has_no_cause_is_inaccurate_and_another_motion_in_the_same_run_is_t
         assert short(simulator).faults == [fault]
 
 
-def test_samples_that_are_fewer_than_the_steps_show_their_kind():
-    scene = replace(SCENES[3], divided=(1,))
-    for simulator, faults in ((stepped, ['explicit_gyroscopic_term']), (euler, [])):
-        def run(top, start, times, dt, simulator=simulator):
-            options = {'method': 'explicit'} if simulator is stepped else {}
-            attitudes, rates, _ = simulator(top, start, times, 0.2 * dt, **options)
-            return {'attitudes': attitudes, 'rates': rates}
-
-        assert grade(run, dt=0.01, scenes=[scene]).faults == faults
-
-
-def test_noise_that_is_not_declared_is_no_fault():
-    def run(top, *given):
-        return Imu(defect='residuals')(SENSOR, *given)
-
-    unknown = {'gyroscope_noise_density': None, 'accelerometer_noise_density': None}
-    assert short(run, replace(WHEEL, **unknown)).passed
-
-
-@pytest.mark.parametrize(('theta', 'gravity'), [(0.0, 9.8), (math.pi, -9.8), (0.0, 0.0)])
-def test_a_top_that_only_spins_shows_no_faults_that_cannot_be_seen(theta, gravity):
-    spin = Scene('spin', {'theta': theta, 'l3': 2.0, 'lz': 2.0 * math.cos(theta)}, 0.5)
-    assert grade(Imu(), body=replace(WHEEL, gravity=gravity), scenes=[spin], dt=0.01).passed
-
-
 def test_all_faults_are_in_the_page_and_no_other():
     page = (ROOT / 'docs/grade.md').read_text(encoding='utf-8')
     _, table = page.split('| fault | signature |')
@@ -176,7 +144,7 @@ def test_all_faults_are_in_the_page_and_no_other():
     # Those without a simulator or a body there have a test of their own, or are causes of causes.
     assert {*names} - named == {
         'invalid_output', 'not_deterministic', 'inaccurate', 'early', 'gravity', 'matrix',
-        'no_linear_acceleration', 'no_acceleration'}
+        'no_linear_acceleration'}
 
 
 def at_rest(t):
@@ -188,10 +156,10 @@ def at_rest(t):
     (lambda t: sys.exit(3), 'cusps: run raises SystemExit'),
     (lambda t: None, 'must have attitudes'),
     (lambda t: np.ones((len(t), 4)), 'the norm must be 1'),
-    (lambda t: np.eye(4)[:1], 'attitudes has shape (1, 4): must be (1001, 4)'),
+    (lambda t: np.eye(4)[:1], '(1, 4), 0 numbers are not finite: must be (1001, 4)'),
     (lambda t: {'poses': 1}, "has ['poses']: must have attitudes"),
     (lambda t: {'attitudes': at_rest(t), 'rates': 0.0 * at_rest(t)[:, :3] + np.nan},
-     'rates[0, 0] = nan: must be finite'),
+     '3003 numbers are not finite'),
     (lambda t: {'attitudes': at_rest(t), 'gyroscope': 'no'}, 'gyroscope: ')])
 def test_what_is_no_motion_is_told(said, says):
     report = grade(lambda top, start, times, dt: said(times), scenes=SHORT[:1])

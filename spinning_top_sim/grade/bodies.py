@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.causes import OFFSETS, judge
-from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Comparison, Imu
+from spinning_top_sim.grade.causes import CLEARLY, OFFSETS, judge
+from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, UP, Comparison, Imu
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
-from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
@@ -40,22 +39,18 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     subject : str
         Name of what is graded.
     """
-    imu, parts, faults = imu or Imu(), dict(parts), list[Finding]()
-    for name, (times, values) in parts.items():
-        new, hold = held(name, values)
-        if hold:
-            faults.append(hold)
-            if name not in READINGS:
-                return Report(subject, faults, unjudged=['readings, beside held poses'])
-            parts[name] = times[new], values[new]
-    bodies, left_out = stretches(parts)
-    notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] if left_out else []
-    if not bodies:
-        return Report(subject, faults, {}, notes, unjudged=[
-            'readings: no part without a gap is long enough'])
-    if any(body.coarse for body in bodies):
-        return Report(subject, faults, {}, notes, unjudged=[
-            f'readings: the body turns by more than {MOST:g} rad between two samples'])
+    imu, new = imu or Imu(), {name: held(name, values) for name, (_, values) in parts.items()}
+    faults = [fault for _, found in new.values() for fault in found]
+    bodies, left_out = stretches({name: (times[new[name][0]], values[new[name][0]])
+                                  if new[name][1] else (times, values)
+                                  for name, (times, values) in parts.items()})
+    notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] * bool(left_out > 0.0)
+    why = ('beside held poses' if any(new[name][1] for name in new.keys() - READINGS.keys()) else
+           'no part without a gap is long enough' if not bodies else
+           f'the body turns by more than {MOST:g} rad between two samples'
+           if any(body.coarse for body in bodies) else '')
+    if why:
+        return Report(subject, faults, {}, notes, unjudged=[f'readings: {why}'])
     convention = convention_of(bodies, imu, gravity)
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
@@ -65,19 +60,15 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
         judge(name, bodies, imu, gravity, placed='positions' in parts) for name in READINGS))
 
 
-def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], Finding | None]:
+def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:
     """Return which rows (n, k) are not those before, and the fault if each is told again."""
     new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
     runs = np.diff(np.flatnonzero(new))
-    if len(runs) < HELD_RUNS:
-        return new, None
-    usual = math.floor(float(np.median(runs)))
+    usual = runs[np.abs(runs - np.median(runs)) <= 1.0] if len(runs) >= HELD_RUNS else runs[:0]
     # Others are longer: the body rests.
-    near = max((runs[(runs == usual + k) | (runs == usual + k + 1)] for k in (-1, 0)), key=len)
-    count = float(np.mean(near))
-    return new, Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
-                        'log, is slower than its stamps', count) if (
-                            len(near) >= HELD_SHARE * len(runs) and count >= 1.3) else None
+    count = float(np.mean(usual)) if len(usual) > HELD_SHARE * len(runs) else 1.0
+    return new, [Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
+                         'log, is slower than its stamps', count)] * (count >= 1.3)
 
 
 def undone(body: Stretch, convention: Convention) -> Stretch:
@@ -86,47 +77,48 @@ def undone(body: Stretch, convention: Convention) -> Stretch:
                    positions=Rotation.from_quat(convention.world).inv().apply(body.positions))
 
 
+def _of_sensor(one: Convention) -> bool:
+    """Return whether a convention is, but for a turn about z of the world, axes of the sensor."""
+    turn = Rotation.from_quat(one.world)
+    return any(part.startswith('sensor') for part in one.parts) or bool(
+        turn.magnitude() > 0.1 and turn.apply(UP)[2] > 0.9 and not one.conjugate)
+
+
 def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Convention:
     """
     Return how attitudes are told: ours, unless another explains readings that ours does not.
 
     Axes of the sensor are left to the readings, and a z that is down to the sign of gravity.
     """
-    ours, *others = [one for one in conventions.group() if not any(
-        part.startswith('sensor') for part in one.parts)]
+    ours, *others = (one for one in conventions.group() if not _of_sensor(one))
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
-    count = int(np.clip(EXCERPT_S / body.step, *SAMPLES))
-    first = int(np.argmax(angles[count:] - angles[:-count])) if len(angles) > count else 0
+    count = min(int(np.clip(EXCERPT_S / body.step, *SAMPLES)), len(angles) - 1)
+    first = int(np.argmax(angles[count:] - angles[:-count]))
     body = body.part(slice(first, first + count))       # in which it turns the most
-
     # No convention changes how fast quaternions change, and so none the noise in rates.
-    widths = {name: compared.motions[0].width for name in ('gyroscope', 'accelerations')
+    widths = {name: [compared.motions[0][0].width] for name in ('gyroscope', 'accelerations')
               if (compared := Comparison(name, [body], imu, gravity)).motions}
-    if not widths:
-        return ours
 
-    def left(convention: Convention, sign: float = 1.0, most: float = math.inf) -> Reals:
-        """Return the shares of readings that are not right in any unit; inf after one > most."""
-        told, shares = undone(body, convention), np.full(len(widths), math.inf)
-        for k, (name, width) in enumerate(widths.items()):
-            compared = Comparison(name, [told], imu, sign * gravity, [width])
-            compared.compare(0)
-            found, _, residual = compared.fit(['total', *compared.always, *OFFSETS])
-            right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1
-                        for size in compared.units.values())
-            shares[k] = beyond(residual, compared.floor) if right else 1.0
-            if shares[k] > most:
-                break
-        return shares
+    def left(convention: Convention, most: float = math.inf, sign: float = 1.0) -> float:
+        """Return the largest share of a reading that is not right in any unit, or one > most."""
+        told, worst = undone(body, convention), 0.0
+        for name, width in widths.items():
+            if worst <= most:
+                compared = Comparison(name, [told], imu, sign * gravity, width)
+                model = compared.model(0)
+                fit = model.fit(['total', *OFFSETS])
+                size = 1.0 + fit.found[len(compared.always)]
+                right = not model.clear('total', CLEARLY) or any(
+                    abs(size * unit - 1.0) < 0.1 for unit in compared.units.values())
+                worst = max(worst, fit.beyond if right else 1.0)
+        return worst
 
     before = left(ours)
-    enough = min(RIGHT * float(np.max(before)), SMALL)
-    if np.max(before) < WRONG or np.max(left(ours, -1.0)) < enough:
+    enough = min(RIGHT * before, SMALL)
+    if before < WRONG or left(ours, sign=-1.0) < enough:
         return ours
-    after = np.array([left(one, most=enough) for one in others])
-    # No reading may agree less.
-    worst = np.where(np.any(after > 1.5 * before + 1e-3, axis=1), np.inf, np.max(after, axis=1))
+    after = [left(one, enough) for one in others]
     # Of equally good ones the first has the fewest parts.
-    best = int(np.argmax(worst <= 1.5 * np.min(worst) + 1e-6))
-    return others[best] if worst[best] < enough else ours
+    best = int(np.argmax(np.array(after) <= 1.5 * min(after) + 1e-6))
+    return others[best] if after[best] < enough else ours

@@ -47,21 +47,17 @@ class Body(Imu, Top):
 @dataclass(frozen=True, kw_only=True)
 class Start(State):
     """
-    A start state with what engines need.
+    A state with what engines need.
 
-    Parameters
-    ----------
-    attitude : (4,) float
-        q(world <- body) as x, y, z, w; z of the world points up.
-    rates : (3,) float
-        Angular velocity in the body frame [rad/s].
+    attitude : (4,) q(world <- body) as x, y, z, w; z of the world points up
+    rates : (3,) angular velocity in the body frame [rad/s]
     """
 
     attitude: tuple[float, float, float, float]
     rates: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        State(**{one.name: getattr(self, one.name) for one in fields(State)})
+        """Accept what is made of a state."""
 
     @classmethod
     def of(cls, top: Top, state: State) -> Self:
@@ -76,16 +72,9 @@ class Scene:
     """
     A motion that is graded.
 
-    Parameters
-    ----------
-    name : str
-        Of the scene, in reports.
-    start : mapping
-        l3, lz, theta and theta_dot, those that are not 0.
-    duration : float
-        Length [s].
-    divided : tuple of int
-        Divisors of dt, 1 first; several give the order of convergence.
+    start : l3, lz, theta and theta_dot, those that are not 0
+    duration : length [s]
+    divided : divisors of dt, 1 first; several give the order of convergence
     """
 
     name: str

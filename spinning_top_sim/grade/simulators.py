@@ -4,22 +4,23 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import dynamics
 from spinning_top_sim.grade.bodies import held
-from spinning_top_sim.grade.causes import judge
-from spinning_top_sim.grade.columns import KINDS, NORM, READINGS
+from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, judge, listed
+from spinning_top_sim.grade.columns import AXES, KINDS, NORM, READINGS, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line, progress
-from spinning_top_sim.tools.kinematics import MOST, Reals, Smoothed, Stretch, white
+from spinning_top_sim.tools.identify import NEAR, TARGET, Cause, Model, explain, instead, rms
+from spinning_top_sim.tools.kinematics import MOST, Reals, Smoothed, Stretch, along, white
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
 Simulate = Callable[[Body, Start, Reals, float], Any]
@@ -27,10 +28,12 @@ Simulate = Callable[[Body, Start, Reals, float], Any]
 TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
 WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
-
-
-class InvalidTrajectoryError(ValueError):
-    """A simulator has returned no motion; the text names what and why."""
+SAME = 0.1              # share of an error that another time leaves
+# Mean over the interval in the middle of six samples, for polynomials of degree 5.
+_MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
+UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
+EXPLAINED = 0.25    # of the discrepancy is left at most
+SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
 def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
@@ -50,10 +53,8 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
     dt : float
         The step [s].  Samples are dt apart, also where the order of convergence is measured with
         smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
-    body : Body
-        The top and the IMU on it.
-    scenes : sequence of Scene
-        Motions to run.
+    body, scenes : Body, sequence of Scene
+        The top with an IMU, and its motions.
     seed : int
         Determines how the top is turned at the start.
     tolerance : float
@@ -63,9 +64,7 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
 
     Raises
     ------
-    TypeError
-        If `run` cannot be called.
-    ValueError
+    TypeError, ValueError
         Naming the argument, its value and what is allowed.
     """
     if not callable(run):
@@ -84,7 +83,7 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
                 continue
             try:
                 judgement.run(run, scene, start)
-            except InvalidTrajectoryError as error:
+            except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
     if len(unjudged) == len(scenes):
         raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
@@ -96,53 +95,41 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
 
 
 def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Stretch:
-    """Return the motion that a run says.  Raises InvalidTrajectoryError."""
+    """Return the motion that a run says.  Raises ValueError."""
     try:
         said = run(body, start, times.copy(), dt)
     except (Exception, SystemExit) as error:
-        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
-                                     f'{one_line(error)}') from error
+        raise ValueError(f'run raises {type(error).__name__}: {one_line(error)}') from error
     said = said if isinstance(said, Mapping) else {'attitudes': said}
-    readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
-                for name in ('attitudes', *KINDS) if said.get(name) is not None}
+    readings: dict[str, Reals] = {}
+    for name in ('attitudes', *KINDS):
+        if said.get(name) is not None:
+            try:
+                readings[name] = values = np.array(said[name], dtype=float)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f'{name}: {error}') from error
+            shape, bad = (len(times), 4 if name == 'attitudes' else 3), ~np.isfinite(values)
+            if values.shape != shape or np.any(bad):
+                raise ValueError(f'{name} has shape {values.shape}, {np.sum(bad)} numbers are not '
+                                 f'finite: must be {shape}, all finite')
     if 'attitudes' not in readings:
-        raise InvalidTrajectoryError(
-            f'what is returned has {[name for name in said if said[name] is not None]}: must have '
-            'attitudes')
+        raise ValueError(f'what is returned has {[*said]}: must have attitudes')
     attitudes = readings.pop('attitudes')
     for at in np.flatnonzero(np.abs(np.linalg.norm(attitudes, axis=1) - 1.0) > NORM)[:1]:
-        raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
-                                     'must be 1')
+        raise ValueError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm must be 1')
     return Stretch(times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
                    {name: white(values, jumps=False) for name, values in readings.items()})
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
-    """Return an array of this shape.  Raises InvalidTrajectoryError."""
-    try:
-        numbers = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InvalidTrajectoryError(f'{name}: {error}') from error
-    if numbers.shape != shape:
-        raise InvalidTrajectoryError(f'{name} has shape {numbers.shape}: must be {shape}')
-    for at in np.argwhere(~np.isfinite(numbers))[:1]:
-        raise InvalidTrajectoryError(f'{name}{at.tolist()} = {numbers[tuple(at)]}: must be finite')
-    return numbers
-
-
 @dataclass
 class Motion:
-    """
-    What is told of a motion.
-
-    worst : its largest angle to the exact attitudes [rad]
-    of_start : share of it that follows from wrong rates in the first step
-    """
+    """What is told of a motion."""
 
     name: str
     told: Stretch
-    worst: float
-    of_start: float = 0.0
+    worst: float                # its largest angle to the exact attitudes [rad]
+    slow: bool                  # whether it is the right motion at another rate, at first
+    order: float = math.nan     # p of errors ~ dt^p
 
 
 class Judgement:
@@ -152,127 +139,188 @@ class Judgement:
         self.body, self.dt, self.tolerance = body, dt, tolerance
         self.motions: list[Motion] = []
         self.faults: list[Finding] = []
-        self.orders: dict[str, float] = {}
 
     def run(self, run: Simulate, scene: Scene, start: Start) -> None:
-        """Add the motion of a scene.  Raises InvalidTrajectoryError."""
+        """Add the motion of a scene.  Raises ValueError."""
         times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
-
         told = [told_motion(run, self.body, start, times, self.dt / divided)
                 for divided in scene.divided]
         if not self.motions and not np.array_equal(told[0].matrices, told_motion(
                 run, self.body, start, times, self.dt).matrices):
             self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
                                        'same run twice differ'))
-        for name, values in {'attitudes': told[0].rotation.as_quat(), **told[0].readings}.items():
-            _, hold = held(name, values)
-            if hold:                            # what is held is not graded
-                self.faults.append(hold._replace(evidence=f'{scene.name}: {hold.evidence}'))
-                if name == 'attitudes':
-                    return
-                told[0].readings = {kind: one for kind, one in told[0].readings.items()
-                                    if kind != name}
+        readings = {'attitudes': told[0].rotation.as_quat(), **told[0].readings}
+        holds = {name: hold for name, values in readings.items()
+                 for hold in held(f'{scene.name}: {name}', values)[1]}
+        self.faults += holds.values()
+        if 'attitudes' in holds:                # what is held is not graded
+            return
+        told[0].readings = {name: one for name, one in told[0].readings.items()
+                            if name not in holds}
         same = [self.beside_truth(scene.name, start, one) for one in told]
         self.motions.append(same[0])
         errors = [one.worst for one in same]
-        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding: errors ~ dt^p
-            self.orders[scene.name] = -float(np.polyfit(
-                np.log(scene.divided), np.log(errors), 1)[0])
+        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding
+            same[0].order = -float(np.polyfit(np.log(scene.divided), np.log(errors), 1)[0])
 
     def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
-        solution, early = ExactSolution(self.body, start), slice(0, EARLY)
-
-        def errors_of(told: Stretch, late: int = 0) -> Reals:
-            truth = solution.states_at_seconds(told.t - late * self.dt).quaternion
-            return (Rotation.from_quat(truth).inv() * told.rotation).magnitude()
-
-        errors = errors_of(told)
-        error = float(np.max(errors[early]))
-        for late in (-1, 1) if error > min(WRONG, 2.0 * self.tolerance) else ():
-            other = errors_of(told, late)
-            if np.max(other[early]) < RIGHT * error and np.median(other) < RIGHT * np.median(
-                    errors):
-                self.faults.append(Finding(
-                    'late' if late > 0 else 'early', f'{name}: the attitudes are those of '
-                    f'one step {"before" if late > 0 else "after"}', float(late)))
-                return Motion(name, told, float(np.max(other)))
-        if error > WRONG:
-            q = told.rotation.as_quat()
-            found = conventions.best(q[early], solution.states_at_seconds(
-                told.t[early]).quaternion)
-            if found.convention.parts and found.after < RIGHT * found.before:
-                self.faults.append(Finding(
-                    'convention', f'{name}: attitudes are told as {found.convention.name}; '
-                    'this is undone', found.before))
-                told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
-                errors = errors_of(told)
-        return Motion(name, told, float(np.max(errors)), self._of_start(told, solution, errors))
-
-    def _of_start(self, told: Stretch, solution: ExactSolution, errors: Reals) -> float:
-        """Return the share of errors that is as by the wrong turn in the first step."""
-        at = int(np.argmax(errors >= 0.5 * np.max(errors)))
-        truth = solution.states_at_seconds(told.t[:2])
-        turned, right = ((turn[0].inv() * turn[1]).as_rotvec() / self.dt
-                         for turn in (told.rotation[:2], Rotation.from_quat(truth.quaternion)))
-        along = truth.angular_velocity[0] / (np.linalg.norm(truth.angular_velocity[0]) or 1.0)
-        # A step may turn by the rates of its beginning or of its end.
-        unclear = self.dt * abs(float(truth.angular_acceleration[0] @ along))
-        return max(abs(float((turned - right) @ along)) - unclear, 0.0) * float(
-            told.t[at] / (errors[at] or 1.0))
+        solution = ExactSolution(self.body, start)
+        truth = solution.states_at_seconds(told.t)
+        q, exact = told.rotation.as_quat(), Rotation.from_quat(truth.quaternion)
+        found = conventions.best(q[:EARLY], truth.quaternion[:EARLY]) if np.max(
+            (exact.inv() * told.rotation).magnitude()[:EARLY]) > WRONG else None
+        if found and found.convention.parts and found.after < RIGHT * found.before:
+            self.faults.append(Finding('convention', f'{name}: attitudes are told as '
+                                       f'{found.convention.name}; this is undone', found.before))
+            told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
+        # A lag and another rate of the clock turn about the rates.
+        errors, w = (exact.inv() * told.rotation).as_rotvec(), truth.angular_velocity[:EARLY]
+        model = Model([{TARGET: errors[:EARLY], 'late': -self.dt * w,
+                        'slow': told.t[:EARLY, np.newaxis] * w}])
+        fit = model.fit(['late', 'slow'])
+        late, explained = float(fit.found[0]), fit.rest < SAME * model.size(TARGET)
+        if explained and abs(late) > LATE:
+            self.faults.append(Finding(
+                'late' if late > 0.0 else 'early', f'{name}: the attitudes are those of '
+                f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
+            exact = Rotation.from_quat(solution.states_at_seconds(
+                told.t - late * self.dt).quaternion)
+        return Motion(name, told, float(np.max((exact.inv() * told.rotation).magnitude())),
+                      explained and abs(late) < LATE)
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
         if not self.motions:
             return
         of_rates = self._readings('rates').found
-        first = of_rates[0].name if of_rates else ''
-        wrong = max(motion.worst for motion in self.motions) > self.tolerance
-        if not first or (wrong and first == 'rates_scale'):     # rates that are told are known
+        scaled = [one.name for one in of_rates] == ['rates_scale'] and max(
+            motion.worst for motion in self.motions) > self.tolerance
+        if not of_rates or scaled:              # rates that are told are known
             for motion in self.motions:
                 motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
-        yield Report('rates', of_rates)
-        found = [fault for fault in self._of_motions() if not (
-            first == 'rates_scale' and fault.name == 'inaccurate')]
-        yield Report('motions', found, {
-            name: mark for motion in self.motions for name, mark in self._marks(motion)})
+        yield Report('', of_rates)
+        yield Report('', [one for one in self._of_motions() if not (
+            scaled and one.name == 'inaccurate')], {
+                name: mark for motion in self.motions for name, mark in self._marks(motion)})
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
-        told = [motion.told for motion in self.motions]
-        # Where no rates are told, half a step may be between readings and attitudes.
-        slack = 0.0 if told[0].rates is not None or kind == 'rates' else max(
-            float(0.5 * (one.rotation[0].inv() * one.rotation[1]).magnitude()) for one in told)
-        return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
+        return judge(kind, [one.told for one in self.motions], self.body, self.body.gravity)
 
     def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
         """Yield the largest error, the relative change of the energy, and the order."""
         yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
                                                       math.degrees(self.tolerance))
         smoothed = Smoothed(motion.told, 1)
-        w, up = smoothed.rates, smoothed.turn[:, 2, 2]
-        energy = 0.5 * w ** 2 @ self.body.inertia + self.body.gravity_torque * up
+        energy = (0.5 * smoothed.rates ** 2 @ self.body.inertia
+                  + self.body.gravity_torque * smoothed.turn[:, 2, 2])
         yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
             energy, float(energy[0]))))))
-        if motion.name in self.orders:
-            yield f'order: {motion.name}', Mark(self.orders[motion.name])
+        yield f'order: {motion.name}', Mark(motion.order)
 
     def _of_motions(self) -> Iterator[Finding]:
         worst = max(self.motions, key=lambda motion: motion.worst)
         if worst.worst <= self.tolerance:
             return
         text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        first = [(scene, order) for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
-        for scene, order in first:
-            yield Finding('first_order', f'{text}; {scene}: the error falls as dt^{order:.2f}',
-                          order)
-        causes = [fault for fault in dynamics.faults_of(
-            self.body, [motion.told for motion in self.motions], self.dt)
-            if worst.of_start < dynamics.EXPLAINED
-            and not (first and fault.name == 'first_order')]
-        yield from (Finding(fault.name, f'{text}; {fault.evidence}', fault.number)
-                    for fault in causes)
-        if not (first or causes):
-            if worst.of_start >= dynamics.EXPLAINED:
-                text += '; it turns at other rates from the start on'
-            yield Finding('inaccurate', text, math.degrees(worst.worst))
+        found = [Finding('first_order', f'{one.name}: the error falls as dt^{one.order:.2f}',
+                         one.order) for one in self.motions if 0.5 < one.order < 1.5][:1]
+        if not worst.slow:
+            found += [one for one in _equations(
+                self.body, [motion.told for motion in self.motions], self.dt)
+                if one.name not in [first.name for first in found]]
+        yield from (one._replace(evidence=f'{text}; {one.evidence}') for one in found)
+        if not found:
+            yield Finding('inaccurate', text + '; it turns at other rates from the start on' * (
+                worst.slow), math.degrees(worst.worst))
+
+
+def _equations(body: Body, motions: Sequence[Stretch], dt: float) -> list[Finding]:
+    """
+    Return what is wrong with the equations of motion, or with steps.
+
+    The change of rates in each step is compared with what gravity and the gyroscopic term, both of
+    the same attitudes and rates, would cause: errors do not add up there.
+    """
+    model = Model([_terms(body, motion, dt) for motion in motions])
+    if model.size(TARGET) < UNIMPORTANT:
+        return []
+    found, rest = explain(model, [
+        Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
+        Cause(['gyroscopic', 'in world'], instead(
+            'inertia_frame', 'the gyroscopic term is that of moments of inertia about axes of the '
+            'world')),
+        Cause(['damping', 'axis damping'], _damping),
+        Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
+        Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
+    return found if rest.rest < EXPLAINED * model.size(TARGET) else []
+
+
+def _terms(body: Body, motion: Stretch, dt: float) -> dict[str, Reals]:
+    """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
+    smoothed = Smoothed(motion, 1)
+    step, w, inertia = motion.step, smoothed.rates, body.inertia
+    z, world = smoothed.turn[:, 2], along(smoothed.turn, w)
+    gyroscopic = -np.cross(w, w * inertia) / inertia
+    arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in AXES]
+    gravity, products = body.com_distance * arms[2], w[:, [1, 2, 0]] * w[:, [2, 0, 1]]
+    # Effects of other moments: on the torque of gravity about e1 and e2 (I1, I2), then on
+    # (I2 - I3)/I1, (I3 - I1)/I2 and (I1 - I2)/I3, which are fitted, but not read.
+    euler = [gravity * AXES[0], gravity * AXES[1], *(products * axis for axis in AXES)]
+    nodes = {'gyroscopic': gyroscopic, 'gravity': gravity,
+             'in world': along(smoothed.back, -np.cross(world, world * inertia) / inertia),
+             'damping': -w * (1.0, 1.0, 0.0), 'axis damping': -w * AXES[2],
+             **{f'arm {k}': arm for k, arm in enumerate(arms)},
+             **{f'euler {k}': term for k, term in enumerate(euler)}}
+    effects = {name: np.tensordot(_MEAN, [node[at:len(node) - 5 + at] for at in range(6)], 1)
+               for name, node in nodes.items()}
+    for name in ('gyroscopic', 'gravity'):
+        effects[f'{name} step'] = dt / step * np.diff(nodes[name], axis=0)[2:-2]
+    change = np.diff(w, axis=0)[2:-2] / step
+    effects[TARGET] = change - effects['gyroscopic'] - effects['gravity']
+    size = rms(change) or 1.0
+    return {name: effect / size for name, effect in effects.items()}
+
+
+def _gyroscopic(found: Reals) -> Finding | None:
+    share = 1.0 + float(found[0])
+    return None if share >= NEAR else Finding(      # else it is the moments
+        'no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
+        f'the gyroscopic term w x I w has {share:.3g} times its size', share)
+
+
+def _step(found: Reals) -> Finding:
+    at, gravity_at = (0.5 + found).tolist()
+    name, means = (('first_order', f'gravity at {gravity_at:.3g}') if
+                   abs(found[0]) < 0.5 * abs(found[1]) else
+                   ('implicit_damping', 'it removes energy') if at > 0.5 else
+                   ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
+                   ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
+    return Finding(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
+                   f'is 0.5: {means}', at)
+
+
+def _damping(found: Reals) -> Finding:
+    return Finding('damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the '
+                   f'axis and {found[1]:.3g} 1/s about it', float(found[0]))
+
+
+def _com(body: Body, found: Reals) -> Finding:
+    com, size = found + body.com, float(np.linalg.norm(found))
+    ratio = float(com[2]) / (body.com_distance or np.inf)
+    along_axis = np.linalg.norm(found[:2]) < SIDEWAYS * size
+    name, number = (
+        ('gravity', ratio * body.gravity) if along_axis and (
+            abs(ratio * body.gravity / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND) else
+        ('gravity_sign', ratio) if along_axis and ratio < 0.0 else ('com_offset', size))
+    return Finding(name, f'the torque of gravity is {ratio:.5g} times its size, as of a centre of '
+                   f'mass at ({listed(com)}) m', number)
+
+
+def _inertia(body: Body, found: Reals) -> Finding | None:
+    shares = 1.0 + found[:2]
+    return None if np.any(shares <= 0.0) else Finding(
+        'inertia', 'the motion is that of moments of inertia across the axis of '
+        f'{listed(body.lambda1 / shares)} kg m^2, not {body.lambda1:.4g}',
+        float(body.lambda1 / shares[0]))

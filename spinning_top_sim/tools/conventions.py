@@ -32,16 +32,10 @@ class Convention:
     """
     How attitudes are told; the default is ours.
 
-    Parameters
-    ----------
-    w_first, conjugate : bool
-        Order w, x, y, z; q(sensor <- world).
-    world : (4,) array
-        Quaternion of the turn from our world to theirs: they tell `world` q `sensor`.
-    sensor : (4,) array
-        Quaternion from their axes of the sensor to ours.
-    parts : tuple of str
-        What differs from ours, in words.
+    w_first, conjugate : order w, x, y, z; q(sensor <- world)
+    world : (4,) quaternion from our world to theirs: they tell `world` q `sensor`
+    sensor : (4,) quaternion from their axes of the sensor to ours
+    parts : what differs from ours, in words
     """
 
     w_first: bool = False
@@ -103,20 +97,18 @@ def best(told: Reals, truth: Reals, steady: bool = False) -> Found:
     """
     Return the convention in which attitudes agree best with the truth.
 
-    told : attitudes as they are told (n, 4)
-    truth : the same in our convention (n, 4)
+    told, truth : attitudes as they are told, and in our convention (n, 4)
     steady : whether a constant turn about the vertical is no error
 
     Some dozen attitudes that differ from each other by large turns suffice.
     """
-    found = []
-    for one in group():
-        errors = errors_of(one.undo(told), truth)
-        found.append((rms((errors.about_mean() if steady else errors).whole), one))
-    least = min(error for error, _ in found)
+    every = [(one, errors_of(one.undo(told), truth)) for one in group()]
+    found = [Found(one, 0.0, rms((errors.about_mean() if steady else errors).whole))
+             for one, errors in every]
+    least = min(one.after for one in found)
     # The first has the fewest parts.
-    error, chosen = next(pair for pair in found if pair[0] <= max(AS_GOOD * least, SAME))
-    return Found(chosen, found[0][0], error)
+    return next(one for one in found if one.after <= max(AS_GOOD * least, SAME))._replace(
+        before=found[0].after)
 
 
 class Errors(NamedTuple):

@@ -5,14 +5,13 @@ What a rigid body does, by its poses at evenly spaced times: rates and accelerat
 Poses are smoothed by a kernel and then differentiated.  Whatever is compared with them is taken to
 the world, smoothed by the same kernel, and taken back: as a convolution commutes with a
 derivative, smoothing makes no reading wrong, however wide it is.  A smoothing spline would, by its
-own bias.  The noise of what comes out follows from the white noise of the poses.
+own bias.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +29,6 @@ TENTH = _SECOND[-1] * np.array([(-1) ** k * math.comb(10, k) for k in range(11)]
 SIDE = 5                        # samples that a derivative needs on each side
 WIDTHS = 1, 3, 5, 9, 15, 25, 41, 65     # of kernels [samples]
 ORDER = 10                      # of the differences in which motions vanish and noise does not
-# The relative standard deviation of white noise by n of them, times sqrt(n).
-SPREAD = math.sqrt(0.5 * math.comb(4 * ORDER, 2 * ORDER)) / math.comb(2 * ORDER, ORDER)
 MEDIAN = 0.6745                 # of the absolute values of normal noise, in standard deviations
 GAP = 2.5                       # intervals that are a gap
 EVEN = 1e-4                     # share of the interval by which stamps may be uneven
@@ -50,14 +47,9 @@ def kernel(width: int) -> Reals:
     return np.convolve(np.convolve(box, box), box)
 
 
-def gain(width: int, derivative: Sequence[float] | Reals = (1.0,)) -> float:
-    """Return by how much a kernel, and a derivative by samples, multiply white noise."""
-    return float(np.linalg.norm(np.convolve(kernel(width), derivative)))
-
-
 def margin(width: int) -> int:
     """Return how many samples a kernel and a derivative need on each side."""
-    return len(kernel(width)) // 2 + SIDE
+    return 3 * (width - 1) // 2 + SIDE
 
 
 def white(values: Reals, jumps: bool = True) -> float:
@@ -119,6 +111,16 @@ class Stretch:
                        positions=self.positions[chosen], readings={
                            name: values[chosen] for name, values in self.readings.items()})
 
+    def noisier(self, random: np.random.Generator) -> 'Stretch':
+        """Return the same with as much noise again."""
+        def noise(name: str) -> Reals:
+            return self.sigma.get(name, 0.0) * random.standard_normal((len(self.t), 3))
+
+        return replace(
+            self, rotation=self.rotation * Rotation.from_rotvec(noise('attitudes')),
+            positions=self.positions + noise('positions'),
+            readings={name: values + noise(name) for name, values in self.readings.items()})
+
     @property
     def coarse(self) -> bool:
         """Whether there are too few samples to know the rates."""
@@ -141,7 +143,6 @@ class Smoothed:
     second : R^T R'' (m, 3, 3): its antisymmetric part is that of the angular acceleration, its
         symmetric part that of w x (w x ..) [1/s^2]
     acceleration : of the origin, along axes of the body (m, 3) [m/s^2]
-    noise : of turns, of rates, of R^T R'' and of accelerations of the origin
     smooth : which samples (m,) are kept: none where a force sets in suddenly, which makes
         derivatives of samples wrong
     """
@@ -162,10 +163,6 @@ class Smoothed:
         places = self._convolved(body.positions)
         self.acceleration = along(self.back, correlate1d(places, SECOND, axis=0)[self.inner]
                                   / body.step ** 2)
-        one, two = (gain(width, weights) / body.step ** k
-                    for k, weights in ((1, FIRST), (2, SECOND)))
-        turns, moves = body.sigma.get('attitudes', 0.0), body.sigma.get('positions', 0.0)
-        self.noise = turns * gain(width), turns * one, turns * two, moves * two
         self.smooth = np.ones(len(self.rates), bool)
         for values in (smooth, places):
             error, size = (np.linalg.norm(correlate1d(values, weights, axis=0)[self.inner], axis=1)
@@ -175,8 +172,6 @@ class Smoothed:
             self.smooth[:] = True
 
     def _convolved(self, values: Reals) -> Reals:
-        if self.width == 1:
-            return values
         smooth: Reals = correlate1d(values, kernel(self.width), axis=0)
         return smooth
 
@@ -189,8 +184,6 @@ class Smoothed:
 
     def vector(self, values: Reals) -> Reals:
         """Return vectors in the body (n, 3), smoothed as those of the world are (m, 3)."""
-        if self.width == 1:
-            return values[self.inner]
         return along(self.back, self._convolved(along(self.body.matrices, values))[self.inner])
 
 
@@ -204,45 +197,47 @@ def stretches(parts: Parts) -> tuple[list[Stretch], float]:
     """
     times, q = parts['attitudes']
     signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
-    values = {**parts, 'attitudes': (times, q * np.cumprod([1.0, *signs])[:, np.newaxis])}
-    intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in values.items()}
-    step, sigma = max(intervals.values()), {}
-    for name, (at, rows) in values.items():
-        squares = [(white(part, name in ('attitudes', 'positions')) ** 2, len(part))
-                   for part in np.split(rows, _gaps(at) + 1) if len(part) > 2 * ORDER]
+    parts = {**parts, 'attitudes': (times, q * np.cumprod([1.0, *signs])[:, np.newaxis])}
+    intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in parts.items()}
+    step, sigma, spans = max(intervals.values()), {}, [(-math.inf, math.inf)]
+    for name, (at, rows) in parts.items():
+        gaps = np.flatnonzero(np.diff(at) > GAP * intervals[name])
+        pieces = [*zip([0, *gaps + 1], [*gaps + 1, len(at)], strict=True)]
+        squares = [(_noise(name, rows[a:b]) ** 2, b - a) for a, b in pieces if b - a > 2 * ORDER]
         sigma[name] = math.sqrt(sum(one * n for one, n in squares)
                                 / max(sum(n for _, n in squares), 1))
-    sigma['attitudes'] *= 4.0 / math.sqrt(3.0)      # four components of half an angle
-    edges = sorted({float(edge) for at, _ in values.values() for edge in (
-        at[0], *at[_gaps(at)], *at[_gaps(at) + 1], at[-1])})
-    found, left_out = [], 0.0
-    for begin, end in pairwise(edges):
-        inside = {name: np.flatnonzero((at >= begin - 1e-9) & (at <= end + 1e-9))
-                  for name, (at, _) in values.items()}
-        covered = all(len(rows) > 1 and len(rows) > 0.5 * (end - begin) / intervals[name]
-                      for name, rows in inside.items())
-        first, last = (pick([float(values[name][0][rows[k]]) for name, rows in inside.items()])
-                       if covered else begin for k, pick in ((0, max), (-1, min)))
+        spans = [(max(first, at[a]), min(last, at[b - 1])) for first, last in spans
+                 for a, b in pieces if at[a] < last and at[b - 1] > first]
+    found, left_out = [], max(at[-1] for at, _ in parts.values()) - min(
+        at[0] for at, _ in parts.values())
+    for first, last in spans:
         count = int((last - first) / step + 1e-6) + 1
         if count < LEAST:
-            left_out += end - begin
             continue
+        left_out -= last - first
         even: Reals = first + step * np.arange(count, dtype=float)
-        at_even = {name: _at(even, values[name][0][rows], values[name][1][rows])
-                   for name, rows in inside.items()}
-        rotation = Rotation.from_quat(at_even.pop('attitudes'))
-        positions = at_even.pop('positions', np.zeros((count, 3)))
-        found.append(Stretch(even, rotation, positions - positions[0], at_even, sigma, intervals))
-    return found, left_out
+        values = {name: _at(even, *one) for name, one in parts.items()}
+        # Stamps that are not exact make noise, too.
+        noise = {name: max(one, _noise(name, values[name])) for name, one in sigma.items()}
+        rotation = Rotation.from_quat(values.pop('attitudes'))
+        positions = values.pop('positions', np.zeros((count, 3)))
+        found.append(Stretch(even, rotation, positions - positions[0], values, noise, intervals))
+    return found, left_out if left_out > step else 0.0
 
 
-def _gaps(times: Reals) -> NDArray[np.intp]:
-    return np.flatnonzero(np.diff(times) > GAP * np.median(np.diff(times)))
+def _noise(name: str, values: Reals) -> float:
+    """Return the deviation of white noise of a part, of attitudes about each axis [rad]."""
+    # Four components of half an angle.
+    return white(values, name in ('attitudes', 'positions')) * (
+        4.0 / math.sqrt(3.0) if name == 'attitudes' else 1.0)
 
 
 def _at(even: Reals, times: Reals, values: Reals) -> Reals:
     """Return values at times, by splines where they are not there already."""
+    rows = slice(max(int(np.searchsorted(times, even[0] + 1e-9)) - 1, 0),
+                 int(np.searchsorted(times, even[-1] - 1e-9)) + 1)
+    times, values = times[rows], values[rows]
     if len(times) == len(even) and np.max(np.abs(times - even)) < EVEN * (even[1] - even[0]):
         return values
-    spline: Reals = make_interp_spline(times, values, min(DEGREE, len(times) - 1))(even)
+    spline: Reals = make_interp_spline(times, values, DEGREE)(even)
     return spline

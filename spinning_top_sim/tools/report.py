@@ -14,14 +14,9 @@ class Finding(NamedTuple):
     """
     A fault that was found.
 
-    Parameters
-    ----------
-    name : str
-        As in docs/exam.md or docs/grade.md.
-    evidence : str
-        What was measured, in one line.
-    number : float
-        The measured value, such as a lag or a coefficient; NaN where there is none.
+    name : as in docs/exam.md or docs/grade.md
+    evidence : what was measured, in one line
+    number : the measured value, such as a lag or a coefficient; NaN where there is none
     """
 
     name: str
@@ -33,14 +28,9 @@ class Mark(NamedTuple):
     """
     A measure.
 
-    Parameters
-    ----------
-    value : float
-        NaN: could not be measured.
-    limit : float
-        From which on it is a fault; NaN: none.
-    meaning : str
-        What it is, in a few words.
+    value : NaN: could not be measured
+    limit : from which on it is a fault; NaN: none
+    meaning : what it is, in a few words
     """
 
     value: float
@@ -48,27 +38,21 @@ class Mark(NamedTuple):
     meaning: str = ''
 
 
+NO_MARK = Mark(math.nan)
+
+
 @dataclass(frozen=True)
 class Report:
     """
     A judgement; `str(report)` is a table.
 
-    Parameters
-    ----------
-    subject : str
-        Name of what was judged.
-    found : sequence of Finding
-        Faults with their evidence, the most important first.
-    marks : mapping of Mark
-        By name.
-    notes : sequence of str
-        What was read.
-    outcomes : sequence
-        What the marks are computed from, for figures.
-    absolute : bool
-        Whether the headings of the outcomes are judged against north, or about their mean.
-    unjudged : sequence of str
-        What was not judged, and why: `passed` says nothing of it.
+    subject : name of what was judged
+    found : faults with their evidence, the most important first
+    marks : by name
+    notes : what was read
+    outcomes : what the marks are computed from, for figures
+    absolute : whether the headings of the outcomes are judged against north, or about their mean
+    unjudged : what was not judged, and why: `passed` says nothing of it
     """
 
     subject: str
@@ -112,21 +96,19 @@ class Report:
 
     def mark_lines(self) -> Iterator[str]:
         """
-        Yield the marks as a table, without those that could not be measured.
+        Yield the marks as tables, without those that could not be measured.
 
         Those that are called 'MARK: SCENE' are a table of their own, scene by mark.
         """
         known = {name: mark for name, mark in self.marks.items() if not math.isnan(mark.value)}
-        scenes: dict[str, dict[str, Mark]] = {}
-        for name, mark in known.items():
-            if ': ' in name:
-                what, _, scene = name.partition(': ')
-                scenes.setdefault(scene, {})[what] = mark
-        limits = {what: mark.limit for marks in scenes.values() for what, mark in marks.items()}
-        if scenes:
-            yield from cli.table_lines('Scenes', ('scene', *limits), [*((scene, *(
-                _number(marks[what].value) if what in marks else '' for what in limits))
-                for scene, marks in scenes.items()), ('limit', *map(_number, limits.values()))])
+        of_scenes = {tuple(name.split(': ')): mark for name, mark in known.items() if ': ' in name}
+        limits = {what: _number(mark.limit) for (what, _), mark in of_scenes.items()}
+        if of_scenes:
+            rows = [(scene, *(_number(of_scenes.get((what, scene), NO_MARK).value)
+                              for what in limits))
+                    for scene in dict.fromkeys(scene for _, scene in of_scenes)]
+            yield from cli.table_lines('Scenes', ('scene', *limits),
+                                       [*rows, ('limit', *limits.values())])
         others = {name: mark for name, mark in known.items() if ': ' not in name}
         if others:
             width = max(len(mark.meaning) for mark in others.values())

@@ -4,7 +4,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 GRAVITY = 9.80665
@@ -48,35 +47,22 @@ def forced(t, random, rate):
             sizes * np.sin(speeds * t[:, np.newaxis, np.newaxis] + phases), axis=2))
 
     h = 1e-3
-
-    def turns(k):
-        """Return the turns in k h and in -k h."""
-        return [(turned(t).inv() * turned(t + sign * k * h)).as_rotvec() for sign in (1, -1)]
-
-    (one, less), (two, least) = turns(1), turns(2)
+    one, less, two, least = ((turned(t).inv() * turned(t + k * h)).as_rotvec()
+                             for k in (1, -1, 2, -2))
     return (turned(t), (8.0 * (one - less) - (two - least)) / (12.0 * h),
             (16.0 * (one + less) - (two + least)) / (12.0 * h * h))
 
 
 def free(t, random, rate):
-    """Return the same of a free asymmetric body."""
-    inertia = np.array((1.0, random.uniform(1.2, 1.6), random.uniform(1.7, 2.2)))
-    w0 = random.standard_normal(3)
+    """Return the same of a free symmetric body."""
+    w0, turn = random.standard_normal(3), random.uniform(0.4, 0.8)
     w0 *= rate / np.linalg.norm(w0)
-
-    ratios = (np.roll(inertia, -1) - np.roll(inertia, -2)) / inertia
-
-    def slope(_, y):
-        a, b, c, x, y, z, w = y.tolist()
-        return (*(ratios * (b * c, c * a, a * b)), 0.5 * (w * a + y * c - z * b),
-                0.5 * (w * b + z * a - x * c), 0.5 * (w * c + x * b - y * a),
-                -0.5 * (x * a + y * b + z * c))
-
-    q0 = Rotation.random(random_state=int(random.integers(1 << 30))).as_quat()
-    y = solve_ivp(slope, (t[0], t[-1] + 1e-9), [*w0, *q0], 'DOP853', t, rtol=1e-12,
-                  atol=1e-13).y.T
-    w = y[:, :3]
-    return Rotation.from_quat(y[:, 3:]), w, np.cross(inertia * w, w) / inertia
+    # It precesses about its angular momentum, and the rates turn about its axis.
+    about = Rotation.from_rotvec(np.outer(t, (0.0, 0.0, turn * w0[2])))
+    w = about.apply(w0)
+    start = Rotation.random(random_state=int(random.integers(1 << 30)))
+    precession = Rotation.from_rotvec(np.outer(t, start.apply(w0 * (1.0, 1.0, 1.0 + turn))))
+    return precession * start * about.inv(), w, np.cross((0.0, 0.0, turn * w0[2]), w)
 
 
 def body(seed, noisy=None, seconds=20.0, kind=None, rate=None):

@@ -53,22 +53,6 @@ def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, worl
     return y[:4].T, y[4:].T, accelerations(y[:4], y[4:]).T
 
 
-def _turned(q, w, dt):
-    """Return the attitude w, x, y, z after a rotation by w dt in the body frame."""
-    a, b, c, d = q
-    x, y, z = w
-    half = 0.5 * dt * math.sqrt(x * x + y * y + z * z)
-    s = 0.5 * dt * (math.sin(half) / half if half else 1.0)
-    x, y, z, e = s * x, s * y, s * z, math.cos(half)
-    return (a * e - b * x - c * y - d * z, a * x + b * e + c * z - d * y,
-            a * y - b * z + c * e + d * x, a * z + b * y - c * x + d * e)
-
-
-def _up(q):
-    a, b, c, d = q
-    return complex(2.0 * (b * d - a * c), 2.0 * (c * d + a * b))
-
-
 def stepped(top, start, times, dt, method):
     """
     Return the same by steps of first order.
@@ -76,20 +60,20 @@ def stepped(top, start, times, dt, method):
     method : of the gyroscopic term: explicit, implicit, midpoint, or wrong derivative, where an
         implicit step has its derivative with the wrong sign
     """
-    (x, y, z, w), (w1, w2, spin) = start.attitude, start.rates
-    q, across, rows = (w, x, y, z), complex(w1, w2), []
+    turn, (w1, w2, spin) = Rotation.from_quat(start.attitude), start.rates
+    across, rows = complex(w1, w2), []
     share = (top.lambda1 - top.lambda3) / top.lambda1 * spin
     at = {'explicit': 0.0, 'midpoint': 0.5, 'implicit': 1.0, 'wrong derivative': -1.0}[method]
     stride = round((times[1] - times[0]) / dt)
     for number in range((len(times) - 1) * stride + 1):
         if number % stride == 0:
-            rows.append((*q, across.real, across.imag, spin))
-        change = -1j * (share * across + top.gravity_torque / top.lambda1 * _up(q))
+            rows.append((*turn.as_quat(), across.real, across.imag, spin))
+        up = complex(*turn.as_matrix()[2, :2])
+        change = -1j * (share * across + top.gravity_torque / top.lambda1 * up)
         across += dt * change / (1.0 + at * 1j * dt * share)
-        q = _turned(q, (across.real, across.imag, spin), dt)
+        turn = turn * Rotation.from_rotvec(dt * np.array((across.real, across.imag, spin)))
     states = np.array(rows)
-    return states[:, [1, 2, 3, 0]], states[:, 4:], np.gradient(states[:, 4:], times, axis=0,
-                                                              edge_order=2)
+    return states[:, :4], states[:, 4:], np.gradient(states[:, 4:], times, axis=0, edge_order=2)
 
 
 class Imu:
