@@ -39,16 +39,14 @@ DEFAULT_QOS: Qos = {
     'lifespan': _NEVER,
     'liveliness': 1,                     # automatic
     'liveliness_lease_duration': _NEVER,
-    'avoid_ros_namespace_conventions': False,
-}
+    'avoid_ros_namespace_conventions': False}
 
 _POLICY_NAMES = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
     'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
     'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
-                   'best_available'),
-}
+                   'best_available')}
 _PLAYED = ('reliability', 'durability', 'history', 'depth')
 
 
@@ -119,12 +117,10 @@ def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_na
                      for key, value in topic.offered.items()}],
                 'type_description_hash': definition(topic.type_name)[1]},
              'message_count': count} for topic, count in zip(topics, counts, strict=True)],
-        'compression_format': '',
-        'compression_mode': '',
+        'compression_format': '', 'compression_mode': '',
         'relative_file_paths': [file_name],
         'files': [{'path': file_name, **numbers}],
-        'custom_data': None,
-        'ros_distro': os.environ.get('ROS_DISTRO', 'jazzy')})}
+        'custom_data': None, 'ros_distro': os.environ.get('ROS_DISTRO', 'jazzy')})}
 
 
 def as_yaml(value: object) -> str:

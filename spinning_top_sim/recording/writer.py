@@ -258,12 +258,10 @@ def _sync_directory(directory: Path) -> None:
     """Bring the names in a directory to the disk, if the file system can and lets us."""
     try:
         descriptor = os.open(directory, os.O_RDONLY)
-    except PermissionError:
-        return
-    try:
-        os.fsync(descriptor)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP):
             raise
-    finally:
-        os.close(descriptor)
