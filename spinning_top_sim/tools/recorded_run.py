@@ -69,7 +69,9 @@ def read_run_description(reader: LogReader) -> RunDescription:
                                   for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [_event_before(entry) for entry in json.loads(metadata['history'])]
+        begin_ns = epoch_ns + max(begun_ns, 0)          # without messages it ends there
         check_stamp(epoch_ns)
+        check_stamp(begin_ns)
         environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
         topics = _topics(reader.topics, at_recording)
         journal = [topics[name] for name in topics if name == events.EVENTS]
@@ -79,7 +81,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
             at_start, {**at_start, **changes}, epoch_ns, begun_ns, history, metadata['format'],
             environment, topics, [Logged(message.log_time, Event.decoded(message.data))
                                   for message in reader.messages(journal)],
-            reader.size, max(reader.span[1], epoch_ns))
+            reader.size, max(reader.span[1], begin_ns))
     except MALFORMED as error:
         raise ForeignLogError(f'its metadata or journal cannot be used: {reason_of(error)}'
                               ) from error
