@@ -102,7 +102,7 @@ def test_a_filter_that_is_random_or_shares_state_is_nondeterministic_and_nothing
 
 def test_no_motion_is_degenerate_to_better_than_a_degree():
     motion = motions.excitation(1.0)
-    truth = motion.run('').truth[[part.end - 1 for part in motion.of('rests')]]
+    truth = motion.run('').truth[np.array(motion.kinds) == 'rests']
     assert np.min(Rotation.from_quat(truth).magnitude()) > math.radians(1.0)
     up = measures.up(truth)
     assert np.max(np.abs(up)) < math.cos(math.radians(1.0))
@@ -123,10 +123,9 @@ def test_off_the_axis_the_acceleration_is_that_of_the_point():
     exam = runs.Exam(lambda fed: [feeding.Outcome(run, run.truth, None, None) for run in fed],
                      {}, [0])
     exam.lead = 10
-    ((part,), run) = exam.motion.of('top'), exam.run
     assert checks.lever_arm(exam).value < 1e-12
-    arm = exam.told['lever arm'][0].run
-    rows, rates = slice(part.begin + 450, part.end - 50), run.gyroscope
+    run, arm = exam.run, exam.told['lever arm'][0].run
+    rows, rates = np.flatnonzero(np.array(exam.motion.kinds) == 'top')[450:-50], run.gyroscope
     expected = np.cross(np.gradient(rates, 0.01, axis=0), checks.ARM) + np.cross(
         rates, np.cross(rates, checks.ARM))
     # The rates are those of the middle of a step.

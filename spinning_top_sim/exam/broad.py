@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from spinning_top_sim.exam.examiner import report_of
 from spinning_top_sim.exam.feeding import TOLERANCE, Feed, MakeFilter, feed_apart
-from spinning_top_sim.exam.motions import Run
-from spinning_top_sim.exam.scored import ScoredRun, report_of
+from spinning_top_sim.exam.motions import Run, Scored
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Report
 
@@ -57,7 +57,7 @@ def trials_in(folder: str | Path) -> list[Path]:
     return paths
 
 
-def read_trial(path: Path) -> ScoredRun:
+def read_trial(path: Path) -> Scored:
     """Return the trial of a file.  Raises ValueError if it is none."""
     from scipy.io import loadmat  # noqa: PLC0415 - slow
 
@@ -77,5 +77,5 @@ def read_trial(path: Path) -> ScoredRun:
         raise ValueError(f'{path}: must have a sampling_rate > 0, finite readings, and movement '
                          'with opt_quat')
     step = np.full(len(truth), 1.0 / rate)
-    return ScoredRun(Run(one_line(path.stem), step, truth[:, [1, 2, 3, 0]], gyroscope,
-                         accelerometer, 1e-6 * magnetometer), counts)
+    return Run(one_line(path.stem), step, truth[:, [1, 2, 3, 0]], gyroscope, accelerometer,
+               1e-6 * magnetometer), counts

@@ -20,7 +20,7 @@ from spinning_top_sim.exam.measures import NEES_OFF, USELESS_DEG, degrees
 from spinning_top_sim.exam.motions import FIELD, RATE, STEPS, Reals
 from spinning_top_sim.exam.runs import ANSWER, BACK, BIAS, BIAS_S, LARGE, SMALL, STILL, Exam
 from spinning_top_sim.tools import conventions
-from spinning_top_sim.tools.conventions import errors_of
+from spinning_top_sim.tools.conventions import Errors, errors_of
 from spinning_top_sim.tools.identify import AXES, rms
 from spinning_top_sim.tools.report import Mark
 
@@ -35,6 +35,8 @@ IGNORES = 0.9
 # Of large turns: half of what a step of first order, 2 atan(x / 2), misses.
 TURNS_OFF = LARGE ** 2 / 24.0
 GROWS = 2.0 + GAIN_OFF  # an error that grows slower and slower at most doubles in the second half
+# Steps by which a filter may read force and field late: it has the mean of two, or corrects first.
+SHIFTS = 0.0, 0.5, 1.0, -1.0, -0.5
 BIAS_OFF = 0.3          # of a bias: integrals that leak keep as much
 ARM = 0.1, 0.0, 0.0     # of the IMU off the axis [m]
 
@@ -89,7 +91,7 @@ def convention(exam: Exam) -> Measured:
 
 def gyroscope(exam: Exam) -> Measured:
     """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
-    turns, moves = exam.answers()
+    turns, moves = exam.small_turns
     matrix = np.linalg.lstsq(turns, moves[:, -1], rcond=None)[0].T
     left = float(np.median(np.linalg.norm(moves[:, -1] - turns @ matrix.T, axis=1)
                            / np.linalg.norm(turns, axis=1)))
@@ -121,7 +123,7 @@ def at_rest(exam: Exam) -> Measured:
 
 def delay(exam: Exam) -> Measured:
     """Identify the delay with which the attitude follows the gyroscope."""
-    off = 1.0 - np.median(_gains(*exam.answers()), axis=0)
+    off = 1.0 - np.median(_gains(*exam.small_turns), axis=0)
     off -= off[-1]
     late = float(np.sum(off))
     evidence = (f'the attitude follows the gyroscope {abs(late):.3g} samples '
@@ -141,7 +143,7 @@ def steps(exam: Exam) -> Measured:
     evidence = (f'in steps of {1e3 * STEPS[worst]:g} ms {of_length[worst]:.3g} of a turn is not '
                 'as the gyroscope reads it')
     # As angles, those in equal steps are as much off if the length is not the cause.
-    equal = np.median(np.abs(1.0 - _gains(*exam.answers())[:, 0])) / (STEPS[worst] * RATE)
+    equal = np.median(np.abs(1.0 - _gains(*exam.small_turns)[:, 0])) / (STEPS[worst] * RATE)
     if equal > EXPLAINED * of_length[worst]:
         return Measured(of_length[worst], f'{evidence}, nor in equal steps', 'accuracy')
     return Measured(of_length[worst], f'{evidence}: the length is misused')
@@ -149,8 +151,8 @@ def steps(exam: Exam) -> Measured:
 
 def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with small ones: the closed form is the same for both."""
-    large, small = (float(np.median(_gains(*exam.answers(name, size))[:, 0]))
-                    for name, size in (('large turns', LARGE), ('turns', SMALL)))
+    large, small = (float(np.median(_gains(*answers)[:, 0]))
+                    for answers in (exam.answers('large turns', LARGE), exam.small_turns))
     off = abs(1.0 - large / small)
     return Measured(off, f'a turn of {LARGE:g} rad in one step, {LARGE * RATE:g} rad/s, moves the '
                     f'attitude by {large:.4g} of it, a small one by {small:.4g}; a step of '
@@ -178,21 +180,19 @@ def tilt_answer(exam: Exam) -> Measured:
 
 
 def clean(exam: Exam) -> Measured:
-    """Judge what is left without noise; filters may read force and field at the begin of steps."""
-    settled = slice(exam.lead, None)
-    whole = np.degrees(exam.errors(exam.plain.part(settled)).whole)
-    if np.max(whole) > CLEAN_DEG:
-        force, field = (np.vstack((rows[:1], rows[:-1]))
-                        for rows in (exam.run.accelerometer, exam.run.magnetometer))
-        early = exam.outcome('force of the begin', replace(
-            exam.run, accelerometer=force, magnetometer=field))
-        whole = min(whole, np.degrees(exam.errors(early.part(settled)).whole), key=np.max)
-    parts = exam.motion.parts[1:]           # from when it has settled
-    worst = {part.kind: 0.0 for part in parts}
-    for kind, begin, end in parts:
-        worst[kind] = max(worst[kind], float(np.max(whole[begin - exam.lead:end - exam.lead])))
-    return Measured(max(worst.values()), 'without noise the error is ' + ', '.join(
-        f'{value:.2g} deg ({kind})' for kind, value in worst.items()))
+    """Judge what is left without noise; filters may read force and field a step late or early."""
+    def errors(force: float, field: float) -> Errors:
+        return exam.errors(exam.shifted(force, field).part(slice(exam.lead, None)))
+
+    force = field = 0.0
+    if np.max(errors(force, field).whole) > math.radians(CLEAN_DEG):
+        force = min(SHIFTS, key=lambda shift: float(np.max(errors(shift, field).tilt)))
+        field = min(SHIFTS, key=lambda shift: float(np.max(errors(force, shift).whole)))
+    whole, kinds = np.degrees(errors(force, field).whole), np.array(exam.motion.kinds[exam.lead:])
+    worst = {kind: float(np.max(whole[kinds == kind])) for kind in dict.fromkeys(kinds.tolist())}
+    return Measured(max(worst.values()), f'without noise, and with force and field {force:g} and '
+                    f'{field:g} steps later, the error is ' + ', '.join(
+                        f'{value:.2g} deg ({kind})' for kind, value in worst.items()))
 
 
 def reported_bias(exam: Exam) -> Measured | None:
@@ -246,14 +246,14 @@ def heading_answer(exam: Exam) -> Measured | None:
 
 def lever_arm(exam: Exam) -> Measured:
     """Move the IMU off the axis: the tilt must not follow the specific force."""
-    (part,) = exam.motion.of('top')
-    rows, force = slice(part.begin, part.end), exam.run.accelerometer.copy()
+    rows, force = np.flatnonzero(np.array(exam.motion.kinds) == 'top'), (
+        exam.run.accelerometer.copy())
     turns = Rotation.from_quat(exam.run.truth[rows])
     velocity = np.gradient(turns.apply(ARM), 1.0 / RATE, axis=0)
     force[rows] += turns.inv().apply(np.gradient(velocity, 1.0 / RATE, axis=0))
     with_arm = exam.outcome('lever arm', replace(exam.run, accelerometer=force))
     # When it has come; the last differences are one-sided.
-    rows = slice((part.begin + part.end) // 2, part.end - 2)
+    rows = rows[len(rows) // 2:-2]
     still = exam.plain.estimates[rows]
     tilt = rms(errors_of(with_arm.estimates[rows], still).tilt)
     east, north, up = Rotation.from_quat(exam.run.truth[rows]).apply(

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exam of a filter: the loop over the checks."""
+"""The exam of a filter: the loop over the checks, or over runs whose errors count."""
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.exam import motions, scenes
+import numpy as np
+
+from spinning_top_sim.exam import measures, motions, scenes
 from spinning_top_sim.exam.checks import CHECKS
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, feed_apart
+from spinning_top_sim.exam.motions import Scored
 from spinning_top_sim.exam.runs import Exam
-from spinning_top_sim.exam.scored import report_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
@@ -129,3 +133,44 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
         notes.append('the magnetometer changes nothing: tilt and steady heading are judged')
     noise = exam.noise[:-1] if 'noise' in exam.told else []
     return Report(subject, found, marks, notes, noise, absolute)
+
+
+def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], Scored]], kind: str,
+              subject: str, feed: Feed, show: Callable[[float, float], object]) -> Report:
+    """
+    Return the report on a filter in runs, made one by one; names of marks begin with `kind`.
+
+    The whole error is judged where it counts, of a filter that does not use the field the tilt.
+    """
+    outcomes, failed, whole = [], [], True
+    for done, make_run in enumerate(runs):
+        show(done, len(runs))
+        run, counts = make_run()
+        try:
+            if not done:
+                part = run.part(slice(1000))        # shows whether it uses the field
+                one, other = feed(make_filter, [part, replace(
+                    part, magnetometer=part.magnetometer[:, [1, 2, 0]])])
+                whole = measures.differ(one.estimates, other.estimates)
+            outcomes.append(feed(make_filter, [run])[0].part(counts))
+        except InvalidOutputError as error:
+            failed.append(str(error))
+    show(len(runs), len(runs))
+    faults = [Finding('invalid_output', '; '.join(failed))] if failed else []
+    if not outcomes:
+        return Report(subject, faults)
+    errors = [measures.rmse(one.estimates, one.run.truth) for one in outcomes]
+    total, heading, tilt = np.mean(errors, axis=0).tolist()
+    judged, name = (total, 'error') if whole else (tilt, 'tilt error')
+    if judged > measures.USELESS_DEG:
+        faults.append(Finding('accuracy', f'the mean {name} is {judged:.3g} deg', judged))
+    limits = (measures.USELESS_DEG, math.nan) if whole else (math.nan, measures.USELESS_DEG)
+    marks = {f'{kind}_rms_deg': Mark(total, limits[0], 'in motion, mean over the runs'),
+             f'{kind}_heading_rms_deg': Mark(heading, meaning='heading alone'),
+             f'{kind}_tilt_rms_deg': Mark(tilt, limits[1], 'tilt alone')}
+    names = [one.run.name for one in outcomes]
+    for name in dict.fromkeys(names):
+        of_run = [error[0] for error, other in zip(errors, names, strict=True) if other == name]
+        marks[f'{kind}_rms_{name}_deg'] = Mark(float(np.mean(of_run)))
+    return Report(subject, faults, marks, [] if whole else [
+        'the magnetometer changes nothing: the filter is judged by its tilt'], outcomes, whole)

@@ -99,12 +99,23 @@ class Exam:
     @cached_property
     def ends(self) -> NDArray[np.intp]:
         """The ends of the rests."""
-        return np.array([part.end for part in self.motion.of('rests')])
+        rests = np.array([*self.motion.kinds, '']) == 'rests'
+        return np.flatnonzero(rests[:-1] & ~rests[1:]) + 1
 
     @property
     def plain(self) -> Outcome:
         """The excitation."""
         return self.outcome('excitation', self.run)
+
+    def shifted(self, force: float, field: float) -> Outcome:
+        """Return the excitation with force and field of so many steps later."""
+        if not (force or field):
+            return self.plain
+        steps, run = np.arange(len(self.run.dt)), self.run
+        forces, fields = (np.stack([np.interp(steps + by, steps, one) for one in rows.T], axis=1)
+                          for rows, by in ((run.accelerometer, force), (run.magnetometer, field)))
+        return self.outcome(f'shifted by {force:g}, {field:g}', replace(
+            run, accelerometer=forces, magnetometer=fields))
 
     @property
     def still(self) -> Outcome:
@@ -146,7 +157,12 @@ class Exam:
         gyroscope[steps] += turns / dt[steps, np.newaxis]
         return replace(run, gyroscope=gyroscope, dt=dt)
 
-    def answers(self, name: str = 'turns', size: float = SMALL,
+    @cached_property
+    def small_turns(self) -> tuple[Reals, Reals]:
+        """The answers to SMALL kicks in equal steps."""
+        return self.answers('turns', SMALL)
+
+    def answers(self, name: str, size: float,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
         """
         Return kicks about the vertical (n, 3), and how they move attitudes (n, ANSWER, 3).
