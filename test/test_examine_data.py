@@ -9,8 +9,7 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import motions
-from spinning_top_sim.exam.broad import examine_data
+from spinning_top_sim.exam import examine, motions
 from spinning_top_sim.exam.command import main
 
 NAME = '40_made_slow'
@@ -65,7 +64,7 @@ class Known:
 def test_errors_are_those_of_broad_and_count_in_motion_where_the_truth_is_known(
         run, folder, axis, deg, heading, tilt):
     turn = Rotation.from_rotvec(np.radians(deg) * np.array(axis))
-    report = examine_data(partial(Known, run, turn), folder, subject='known')
+    report = examine(partial(Known, run, turn), data=folder, subject='known')
     assert report.passed, str(report)
     assert report.measures == pytest.approx({
         'data_rms_deg': abs(deg), 'data_heading_rms_deg': heading, 'data_tilt_rms_deg': tilt,
@@ -86,7 +85,7 @@ def test_a_filter_that_fails_in_a_trial_is_told(folder):
         def update(self, gyroscope, accelerometer, magnetometer, dt):
             raise ValueError('no calibration')
 
-    report = examine_data(Bad, folder)
+    report = examine(Bad, data=folder)
     assert report.faults == ['invalid_output'] and not report.measures
     assert f'{NAME}, update 1 of 400: raises ValueError: no calibration' in str(report)
 
@@ -97,7 +96,7 @@ def test_a_filter_that_fails_in_a_trial_is_told(folder):
 def test_a_trial_in_which_nothing_counts_is_refused(trial, tmp_path, change):
     savemat(tmp_path / 'a.mat', {**trial, **change})
     with pytest.raises(ValueError, match='must have a sampling_rate > 0, finite readings, and'):
-        examine_data(None, tmp_path)
+        examine(None, data=tmp_path)
 
 
 def test_what_cannot_be_read_is_told_in_one_line(tmp_path, capsys):

@@ -171,7 +171,8 @@ def tilt_answer(exam: Exam) -> Measured:
                 rows[:1], SMALL * kick[np.newaxis]).part(slice(exam.ends[k])))
             first, later = np.cross(measures.up(moved.estimates[rows]),
                                     measures.up(exam.still.estimates[rows]))
-            back.append(1.0 - float(first @ later) / float(first @ first))
+            # A filter may miss the kick.
+            back.append(1.0 - float(first @ later) / max(float(first @ first), STILL ** 2))
     share = np.array(back[::2]) / np.maximum(back[1::2], measures.ROUNDING)
     return Measured(1.0 - float(np.min(share)), 'gravity leads a tilt about x, y and z back by '
                     f'{", ".join(f"{one:.2g}" for one in back[::2])} of it within '

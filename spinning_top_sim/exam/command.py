@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
-from spinning_top_sim.exam.broad import examine_data
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.feeding import Filter, feed, feed_apart
 from spinning_top_sim.exam.programs import Program
@@ -96,8 +95,6 @@ def _options(arguments: argparse.Namespace, kind: str) -> dict[str, Any]:
     shown, taken = kind if kind == 'log' else f'--{kind}', KINDS[kind]
     if 'topic' in taken and 'topic' not in options:
         raise ValueError(f'{shown} needs --topic')
-    if 'data' in options and 'data' in taken:
-        shown, taken = '--data', ('data',)
     for name in options:
         if name not in taken:
             raise ValueError(f'--{name} cannot be given with {shown}: must be '
@@ -127,11 +124,7 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
             make_filter()
     elif kind == 'filter':
         make_filter, how, name = _own_filter(subject), feed_apart, None
-
-    def judge(data: Path | None = None, **options: Any) -> Report:
-        exam = examine if data is None else partial(examine_data, folder=data)
-        return exam(make_filter, subject=name, feed=how, **options)
-    return judge
+    return partial(examine, make_filter, subject=name, feed=how)
 
 
 def _interrupt(*_: object) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from spinning_top_sim.exam import measures, motions, scenes
+from spinning_top_sim.exam.broad import read_trial, trials_in
 from spinning_top_sim.exam.checks import CHECKS
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, feed_apart
 from spinning_top_sim.exam.motions import Scored
@@ -25,8 +26,8 @@ SEEDS = {'quick': 3, 'field': 1}     # of the noisy runs, of the scenes
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
-            seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
-            feed: Feed = feed_apart,
+            seeds: int | Iterable[int] | None = None, *, data: str | Path | None = None,
+            subject: str | None = None, feed: Feed = feed_apart,
             show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
     Examine an attitude filter.
@@ -49,6 +50,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
         Seeds of the noisy runs, or their number; default: 3, of 'field' 1.
+    data : path, optional
+        A folder with trials of BROAD (.mat), which take the place of a level; each is fed from its
+        first sample on.
     subject : str, optional
         Name in the report; default: that of the filter's class.
     feed : callable, optional
@@ -63,15 +67,11 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Raises
     ------
-    TypeError
-        If `make_filter` cannot be called, such as a filter itself.
     ValueError
-        If the level, a parameter or a seed is not allowed.
+        If the level, a parameter or a seed is not allowed, or there is no trial in the folder.
     """
-    if not callable(make_filter):
-        raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
-                        'filter, a function that returns a new one, or one of '
-                        "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
+    if data is not None and (level, imu, seeds) != ('quick', None, None):
+        raise ValueError('data cannot be given with level, imu or seeds')
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')
@@ -81,6 +81,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     if not numbers or min(numbers) < 0:
         raise ValueError(f'seeds = {seeds!r}: must be a positive number, or integers >= 0')
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
+    if data is not None:
+        return report_of(make_filter, [partial(read_trial, path) for path in trials_in(data)],
+                         'data', subject, feed, show)
     if level == 'quick':
         return _sit(Exam(partial(feed, make_filter), {**motions.CALIBRATED, **values}, numbers),
                     subject, show)

@@ -52,14 +52,12 @@ class Exam:
     def outcomes(self, name: str, make_runs: Callable[[], Sequence[Run]]) -> list[Outcome]:
         """Return the outcomes of runs in our convention; those of a name are fed once."""
         if name not in self.told:
-            self.told[name] = self._feed([
-                run if run.name.startswith(name) else replace(run, name=name)
-                for run in make_runs()])
+            self.told[name] = self._feed(make_runs())
         return list(map(self.ours, self.told[name]))
 
     def outcome(self, name: str, run: Run) -> Outcome:
         """Return the outcome of a run; see `outcomes`."""
-        return self.outcomes(name, lambda: [run])[0]
+        return self.outcomes(name, lambda: [replace(run, name=name)])[0]
 
     def ours(self, told: Outcome) -> Outcome:
         """Return an outcome in our convention."""
