@@ -61,7 +61,8 @@ def test_a_wrong_filter_is_named_by_its_area_and_nothing_else(report, name):
 
 
 @pytest.mark.parametrize('name', ['vqf', 'vqf, six axes', 'mahony, slow', 'mahony, float32',
-                                  'mahony, corrects first'])
+                                  'mahony, corrects first', 'mahony, means of two',
+                                  'mahony, field a step late'])
 def test_a_right_filter_passes(report, name):
     found = report(name)
     assert found.passed, found
@@ -124,6 +125,7 @@ def test_off_the_axis_the_acceleration_is_that_of_the_point():
                      {}, [0])
     exam.lead = 10
     assert checks.lever_arm(exam).value < 1e-12
+    assert checks.tilt_answer(exam).value < 1e-12       # no kick is felt
     run, arm = exam.run, exam.told['lever arm'][0].run
     rows, rates = np.flatnonzero(np.array(exam.motion.kinds) == 'top')[450:-50], run.gyroscope
     expected = np.cross(np.gradient(rates, 0.01, axis=0), checks.ARM) + np.cross(

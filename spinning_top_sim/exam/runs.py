@@ -131,7 +131,8 @@ class Exam:
     def biased(self) -> Outcome:
         """A bias in a rest, and in one in which its axes of the world have other signs."""
         def make() -> list[Run]:
-            motion = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S)
+            # Slowly, so that a bias feels little of a field that is read late.
+            motion = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0), 0.5).rest(BIAS_S)
             run = motion.run('bias')
             return [replace(run, gyroscope=run.gyroscope + BIAS)]
         return self.outcomes('bias', make)[0]

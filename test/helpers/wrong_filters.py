@@ -5,6 +5,7 @@ import importlib.util
 import math
 from collections import deque
 from functools import partial
+from operator import itemgetter
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,27 +25,22 @@ class Part:
     """Another filter, of which something is taken for what it is not."""
 
     def __init__(self, make=Vqf, rates=None, force=None, field=None, said=None, step=None,
-                 late=(0, 0, 0, 0), smooth=(0.0, 0.0, 0.0), report=None, covariance=None):
+                 late=(0, 0, 0, 0), taken=itemgetter(0), report=None, covariance=None):
         self._filter = make()
         self._maps = [one or (lambda v: v) for one in (rates, force, field, said)]
         self._step, self._report, self._covariance = step or (lambda dt: dt), report, covariance
-        self._lines = [deque(maxlen=n + 1) for n in late]
-        self._smooth, self._smoothed = (*smooth, 0.0), [None] * 4
+        self._lines, self._taken = [deque(maxlen=n + 1) for n in late], taken
 
-    def _read(self, k, value, dt):
+    def _read(self, k, value):
         if value is None:
             return None
         self._lines[k].append(self._maps[k](value))
-        value, before = self._lines[k][0], self._smoothed[k]
-        if self._smooth[k] and before is not None:
-            value = before + dt / (dt + self._smooth[k]) * (value - before)
-        self._smoothed[k] = value
-        return value
+        return self._taken(self._lines[k])
 
     def update(self, *readings):
         *sensors, dt = readings
-        read = [self._read(k, value, dt) for k, value in enumerate(sensors)]
-        return self._read(3, self._filter.update(*read, self._step(dt)), dt)
+        read = [self._read(k, value) for k, value in enumerate(sensors)]
+        return self._read(3, self._filter.update(*read, self._step(dt)))
 
     @property
     def bias(self):
@@ -147,7 +143,11 @@ RIGHT = {
     'mahony, float32': partial(Mahony, number=np.float32),
     'mahony, from the identity': partial(Mahony, triad=False),
     'mahony, slow from the identity': partial(Mahony, 0.1, 0.1, 0.01, triad=False),
-    'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True)}
+    'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True),
+    'mahony, means of two': partial(Part, partial(Mahony, 1.0, 1.0, 0.1), late=(0, 1, 1, 0),
+                                    taken=partial(np.mean, axis=0)),
+    'mahony, field a step late': partial(Part, partial(Mahony, 3.0, 3.0, 0.5),
+                                         late=(0, 0, 1, 0))}
 # Each with the faults that may be named.
 WRONG = {
     'rates y x z': (partial(Part, rates=axes(2, 1, 3)), 'gyroscope'),
@@ -157,13 +157,13 @@ WRONG = {
     'rates in deg': (partial(Part, rates=np.radians), 'gyroscope'),
     'rates clipped': (partial(Part, rates=lambda v: np.clip(v, -8.0, 8.0)), 'gyroscope'),
     'rates late': (partial(Part, late=(5, 0, 0, 0)), 'timing'),
-    'rates smoothed': (partial(Part, smooth=(0.05, 0.0, 0.0)), 'timing'),
     'slow turns dropped': (partial(Part, Mahony, rates=lambda v: v * (v @ v > 0.04)), 'accuracy'),
     'force y x z': (partial(Part, force=axes(2, 1, 3)), 'accelerometer'),
     'force negated': (partial(Part, force=np.negative), 'accelerometer'),
     'force x 1.2': (partial(Part, force=scaled(1.2, 1.0, 1.0)), 'accelerometer'),
     'force offset': (partial(Part, force=added(0.0, 0.8, 0.0)), 'accelerometer'),
-    'force smoothed': (partial(Part, Mahony, smooth=(0.0, 0.3, 0.0)), 'accuracy'),
+    'force late': (partial(Part, Mahony, late=(0, 10, 0, 0)), 'accuracy'),
+    'field late': (partial(Part, Mahony, late=(0, 0, 10, 0)), 'accuracy'),
     'no tilt about y': (partial(Mahony, feels=(1.0, 0.0, 1.0)), 'accelerometer'),
     'gain < 0': (partial(Mahony, -0.3), 'accelerometer'),
     'no gravity': (partial(Mahony, 0.0), 'accelerometer'),
