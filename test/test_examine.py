@@ -279,7 +279,7 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
     (['--node', 'x'], '--node needs --topic'),
     (['--filter', 'vqf', '--data', '.', '--level', 'field'], 'data cannot be given with level'),
     (['x', '--topic', '/pose', '--level', 'quick'],
-     '--level cannot be given with log: must be --topic, --truth, --heading')])
+     '--level cannot be given with log: must be --topic, --truth')])
 def test_wrong_arguments_of_the_command(capsys, arguments, says):
     with contextlib.suppress(SystemExit):       # by argparse
         assert main(arguments) == 2

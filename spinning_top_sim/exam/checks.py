@@ -197,17 +197,17 @@ def clean(exam: Exam) -> Measured:
 
 
 def reported_bias(exam: Exam) -> Measured | None:
-    """Judge the bias that is reported, unless it still comes closer to the true one."""
+    """Judge the bias that is reported, unless it comes closer half as fast as a while before."""
     outcome, off, said = exam.biased, [], []
     for axes, rows in _of_bias(outcome):
         told = outcome.biases[rows][np.isfinite(outcome.biases[rows][:, 0])]
-        if len(told) < 4:           # a quarter of them is the end
+        if len(told) < 4:           # of a filter that does not always know it
             return None
         said += [told[0], told[-1]]
-        for axis in axes:
-            *_, before, last = (float(np.max(part)) for part in np.array_split(
-                np.abs(told[:, axis] / BIAS[axis] - 1.0), 4))
-            off.append(last if last > (1.0 - GAIN_OFF) * before else 0.0)
+        quarters = np.abs(told[np.linspace(0, len(told) - 1, 5, dtype=int)] / BIAS - 1.0)
+        before, late, last = quarters[2:, axes]
+        closer = late - last > np.maximum(0.5 * (before - late), measures.ROUNDING)
+        off += np.where(closer, 0.0, last).tolist()
     # The turn between the rests changes the axes of the world, not those of the gyroscope.
     off += (np.abs(said[2] - said[1]) / np.abs(BIAS))[:2].tolist()
     ends = '; '.join(map(_in_degrees, said))
@@ -302,10 +302,10 @@ def _at_rest(outcomes: Sequence[Outcome], axes: slice) -> float:
         one.run.truth[-1], one.estimates[-1])[axes])) for one in outcomes), default=0.0))
 
 
-def _of_bias(outcome: Outcome) -> list[tuple[Sequence[int], slice]]:
+def _of_bias(outcome: Outcome) -> list[tuple[list[int], slice]]:
     """Return axes that are level in the rests with a bias, whose errors gravity shows."""
     n, length = len(outcome.run.dt), round(BIAS_S * RATE)
-    return [((0, 1), slice(length)), ((1, 2), slice(n - length, n))]
+    return [([0, 1], slice(length)), ([1, 2], slice(n - length, n))]
 
 
 def _late(exam: Exam) -> list[Outcome]:

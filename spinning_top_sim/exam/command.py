@@ -39,7 +39,7 @@ from spinning_top_sim.tools.report import Report, printed
 
 # What is examined, and the options that it takes.
 OF_FILTER = 'level', 'imu', 'seeds', 'data'
-KINDS = {'log': ('topic', 'truth', 'heading'), 'node': ('topic', 'level', 'imu', 'seeds'),
+KINDS = {'log': ('topic', 'truth'), 'node': ('topic', 'level', 'imu', 'seeds'),
          'filter': OF_FILTER, 'command': OF_FILTER}
 
 
@@ -56,8 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--topic', help='topic of the attitudes in a log, or of the node')
     add('--truth', help='topic of the true attitudes of the same axes; default: ground_truth/imu')
-    add('--heading', choices=('true',), help='the heading in the log must be right, from true '
-        'north; default: it must be steady')
     add('--data', type=Path, metavar='FOLDER', help='examine with the trials of BROAD in this '
         'folder: readings of a real IMU beside an optical truth (.mat)')
     add('--level', choices=SEEDS, help='level of the exam; default: quick; field: scenes of a '

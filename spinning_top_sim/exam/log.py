@@ -3,7 +3,7 @@
 The exam of a log: attitudes that a node has published, compared with the truth.
 
 The filter cannot get the readings again, so only the attitudes are judged: their convention,
-wrong stamps, the covariance and gross errors.
+wrong stamps, the covariance and gross errors.  The heading must be steady.
 """
 
 import math
@@ -43,8 +43,7 @@ class Stamped(NamedTuple):
     covariances: Reals
 
 
-def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
-                heading: str | None = None) -> Report:
+def examine_log(path: str | Path, topic: str, truth: str = TRUTH) -> Report:
     """
     Examine the attitudes q(world <- sensor) of a topic of an MCAP file.
 
@@ -56,8 +55,6 @@ def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
         Of the attitudes; its type must be one of LAYOUTS.
     truth : str, optional
         Topic of the true attitudes of the same axes.
-    heading : {'true'}, optional
-        Whether the heading counts from true north; by default it must be steady.
 
     Raises
     ------
@@ -75,7 +72,7 @@ def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
                                         f'{stamp_text(int(said.stamps_ns[wrong[0]]))} s: '
                                         f'{wrong[1]}')], notes=notes)
     outcome, before = _beside(one_line(topic), said, true)
-    return replace(_judge(subject, outcome, before, heading == 'true'), notes=notes)
+    return replace(_judge(subject, outcome, before), notes=notes)
 
 
 def _read(reader: LogReader, name: str) -> Stamped:
@@ -120,36 +117,33 @@ def _beside(name: str, said: Stamped, true: Stamped) -> tuple[Outcome, Reals]:
             attitude(t - step_ns).as_quat())
 
 
-def _delay(outcome: Outcome, before: Reals, absolute: bool) -> tuple[float, float, float]:
+def _delay(outcome: Outcome, before: Reals) -> tuple[float, float, float]:
     """Fit errors as a delay; return its number of steps, and the rms without and with it [rad]."""
-    truth, estimates = outcome.run.truth, outcome.estimates
-    if not absolute:
-        mean = np.mean(np.exp(1j * errors_of(estimates, truth).heading))
-        estimates = (Rotation.from_euler('z', -np.angle(mean))
-                     * Rotation.from_quat(estimates)).as_quat()
-    errors, of_a_step = turns(truth, estimates), turns(truth, before)
-    if not absolute:
-        errors[:, 2] -= np.mean(errors[:, 2])
-        of_a_step[:, 2] -= np.mean(of_a_step[:, 2])
+    truth = outcome.run.truth
+    errors, of_a_step = turns(truth, outcome.estimates), turns(truth, before)
+    for one in (errors, of_a_step):
+        one[:, 2] -= np.mean(one[:, 2])
     late = float(np.vdot(of_a_step, errors)) / max(float(np.vdot(of_a_step, of_a_step)), 1e-300)
     return late, rms(errors), rms(errors - late * of_a_step)
 
 
-def _judge(subject: str, outcome: Outcome, before: Reals, absolute: bool) -> Report:
+def _judge(subject: str, outcome: Outcome, before: Reals) -> Report:
     """Find the convention, the delay, and what is left, in the second half."""
     half = slice(len(outcome.run.dt) // 2, None)
-    settled = outcome.part(half)
-    rows = np.linspace(0, len(settled.run.dt) - 1, FEWEST // 2, dtype=int)
-    best = conventions.best(settled.estimates[rows], settled.run.truth[rows],
-                            steady=not absolute)
-    findings, name = [], best.convention.name
+    truth = outcome.run.truth[half]
+    rows = np.linspace(0, len(truth) - 1, FEWEST // 2, dtype=int)
+    best = conventions.best(outcome.estimates[half][rows], truth[rows], steady=True)
+    findings, name, estimates = [], best.convention.name, outcome.estimates
     if name and best.after < EXPLAINED * best.before:
         findings.append(Finding('convention', f'read as {name}, the error falls from '
                                 f'{degrees(best.before)} to {degrees(best.after)}; all measures '
                                 'are those after this correction'))
-        outcome, settled = (replace(one, estimates=best.convention.undo(one.estimates))
-                            for one in (outcome, settled))
-    late, error, left = _delay(settled, before[half], absolute)
+        estimates = best.convention.undo(estimates)
+    mean = float(np.angle(np.mean(np.exp(1j * errors_of(estimates[half], truth).heading))))
+    turn = Rotation.from_euler('z', -mean)
+    outcome = replace(outcome, estimates=(turn * Rotation.from_quat(estimates)).as_quat())
+    settled = outcome.part(half)
+    late, error, left = _delay(settled, before[half])
     seconds = late * float(outcome.run.dt[0])
     if not EARLY <= late <= LATE and left < EXPLAINED * error:
         findings.append(Finding(
@@ -157,10 +151,10 @@ def _judge(subject: str, outcome: Outcome, before: Reals, absolute: bool) -> Rep
             f'{"behind" if late > 0.0 else "ahead of"} its stamp: shifted by that, the error '
             f'falls from {degrees(error)} to {degrees(left)}', seconds))
     errors = errors_of(settled.estimates, settled.run.truth)
-    errors = errors if absolute else errors.about_mean()
     value, ratio = rms(errors.whole), nees_of([settled])
     marks = {'tilt_rms_deg': Mark(math.degrees(rms(errors.tilt)), meaning='in the second half'),
-             'heading_rms_deg': Mark(math.degrees(rms(errors.heading))),
+             'heading_rms_deg': Mark(math.degrees(rms(errors.heading)), meaning='about its mean'),
+             'heading_mean_deg': Mark(math.degrees(mean), meaning='from true north'),
              'error_rms_deg': Mark(math.degrees(value), USELESS_DEG),
              'stamp_offset_s': Mark(seconds, meaning='> 0: late')}
     if not findings and math.degrees(value) > USELESS_DEG:
@@ -170,4 +164,4 @@ def _judge(subject: str, outcome: Outcome, before: Reals, absolute: bool) -> Rep
         if not findings and not 1.0 / NEES_OFF[1] <= ratio <= NEES_OFF[0]:
             findings.append(Finding('covariance', f'the squared error of the tilt is {ratio:.3g} '
                                     'times what the covariance says'))
-    return Report(subject, findings, marks, (), [outcome], absolute)
+    return Report(subject, findings, marks, (), [outcome])
