@@ -162,9 +162,16 @@ class Bad:
     (partial(int, 'north'), ': raises ValueError: invalid literal'),
     (lambda: 'north', ': update returns north: must be 4 finite numbers'),
     (lambda: np.full(4, math.inf), 'must be 4 finite numbers'),
-    (lambda: np.ones(4), 'its norm must be 1')])
-def test_a_filter_that_returns_no_attitude_is_told(said, says):
-    report = examine(partial(Bad, said), seeds=1, feed=feeding.feed)
+    (lambda: np.ones(4), 'its norm must be 1'),
+    (partial(time.sleep, 60.0), 'updates take more than 1 s'),
+    (lambda: ctypes.string_at(0), 'the filter ends the process, exit code -11'),
+    (partial(os._exit, 3), 'the filter ends the process, exit code 3'),
+    (partial(sys.exit, 3), 'raises SystemExit: 3')])
+def test_a_filter_that_returns_no_attitude_or_crashes_is_told(monkeypatch, said, says):
+    if says.endswith(' s'):
+        monkeypatch.setattr(feeding, 'ANSWER_S', 1.0)
+        monkeypatch.setattr(feeding, 'UPDATE_S', 0.0)
+    report = examine(partial(Bad, said), seeds=1)
     assert report.faults == ['invalid_output']
     assert says in str(report) and not report.measures
 
@@ -178,19 +185,6 @@ def test_a_covariance_may_be_unknown_but_not_impossible(short):
     for Known.covariance in (-np.eye(3), 0.5, np.full((3, 3), math.nan), asymmetric):
         with pytest.raises(feeding.InvalidOutputError, match=r'covariance is .*: must '):
             feeding.feed(Known, [short])
-
-
-@pytest.mark.parametrize(('said', 'says'), [
-    (partial(time.sleep, 60.0), 'updates take more than 1 s'),
-    (lambda: ctypes.string_at(0), 'the filter ends the process, exit code -11'),
-    (partial(os._exit, 3), 'the filter ends the process, exit code 3'),
-    (partial(sys.exit, 3), 'raises SystemExit: 3')])
-def test_a_filter_that_never_returns_or_crashes_is_told(monkeypatch, short, said, says):
-    if says.endswith(' s'):
-        monkeypatch.setattr(feeding, 'ANSWER_S', 1.0)
-        monkeypatch.setattr(feeding, 'UPDATE_S', 0.0)
-    with pytest.raises(feeding.InvalidOutputError, match=says):
-        feeding.feed_apart(partial(Bad, said), [short])
 
 
 def test_whatever_a_filter_says_can_be_written(tmp_path):
@@ -275,7 +269,6 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
     ([], 'log --filter --command --node is required'),
     (['x', '--topic', '/pose', '--filter', 'vqf'], 'not allowed with argument'),
     (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'), (['--command', ' '], 'must be a program'),
-    (['x', '--topic', '/pose', '--data', '.'], '--data cannot be given with log'),
     (['--node', 'x'], '--node needs --topic'),
     (['--filter', 'vqf', '--data', '.', '--level', 'field'], 'data cannot be given with level'),
     (['x', '--topic', '/pose', '--level', 'quick'],

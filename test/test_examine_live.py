@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,9 +95,7 @@ def test_another_publisher_is_told_whenever_it_comes(run, monkeypatch):
 
 
 def children(pid):
-    said = subprocess.run(['ps', '-o', 'pid=', '--ppid', str(pid)], capture_output=True, text=True,
-                          check=False).stdout.split()
-    return [int(one) for one in said]
+    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
 
 
 def test_the_node_ends_with_the_exam():
