@@ -56,8 +56,7 @@ def test_the_worst_problem_is_told_and_the_real_time_factor_is_that_since_the_la
     assert (numbers['clock slip [s]'], numbers['failed messages']) == ('1.500', '3'), 'totals'
     recording.error = 'disk full'
     assert told()[:2] == (2, 'recording: disk full')
-    line = report.status_line()
-    assert ' s paused | ' in line and ' | 12 messages to subscribers | ' in line
+    assert ' s paused | ' in report.status_line()
     recording.error = None
     loop.fail('at a pole')
     assert told()[:2] == (2, 'at a pole') and ' s failed | ' in report.status_line()

@@ -67,11 +67,12 @@ class Mahony:
     """A filter of Mahony (2008): gains of tilt, heading [1/s] and bias [1/s^2]."""
 
     def __init__(self, up=0.3, north=0.3, learns=0.02, advance=body, triad=True, first=False,
-                 number=np.float64, level=True, most=np.inf, feels=(1.0, 1.0, 1.0), six=False):
+                 number=np.float64, level=True, most=np.inf, feels=(1.0, 1.0, 1.0), six=False,
+                 in_world=False):
         self._gains, self._advance, self._triad, self._first = (
             (up, north, learns), advance, triad, first)
         self._number, self._level, self._most, self._feels = number, level, most, feels
-        self._six, self._q, self.bias = six, None, np.zeros(3)
+        self._six, self._in_world, self._q, self.bias = six, in_world, None, np.zeros(3)
 
     def _turn(self, a, m, dt):
         up, north, learns = self._gains
@@ -87,7 +88,7 @@ class Mahony:
         return e * dt
 
     def update(self, w, a, m, dt):
-        m = None if self._six else m
+        before, m = self._q, None if self._six else m
         if self._q is None:
             self._q = from_two_vectors(a, m) if self._triad else np.array((0.0, 0.0, 0.0, 1.0))
         elif self._first:       # corrects by the force of the end before it turns
@@ -97,26 +98,12 @@ class Mahony:
             self._q = body(self._q, self._turn(a, m, dt))
         self._q = self._q.astype(self._number).astype(float)
         self._q /= np.linalg.norm(self._q)
+        if self._in_world and before is not None:       # the integral is in axes of the world
+            self.bias = reference.matrix_of(self._q).T @ reference.matrix_of(before) @ self.bias
         return self._q.copy()
 
 
-class IntegralInTheWorld(Mahony):
-    """Keeps its integral in axes of the world, and says it in those of the sensor."""
-
-    def update(self, *readings):
-        before = self._q
-        said = super().update(*readings)
-        if before is not None:
-            turn = reference.matrix_of(said).T @ reference.matrix_of(before)
-            self.bias = turn @ self.bias
-        return said
-
-
-def turned(axis, deg):
-    q = Rotation.from_euler(axis, deg, degrees=True).as_quat()
-    return partial(product, q)
-
-
+EAST = Rotation.from_euler('z', 5.0, degrees=True).as_quat()
 NED = Rotation.from_matrix([(0, 1, 0), (1, 0, 0), (0, 0, -1)]).as_quat()
 RIGHT = {
     'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False),
@@ -154,7 +141,7 @@ WRONG = {
     'hard iron': (partial(Part, field=partial(np.add, (1e-5, 0.0, 0.0))), 'magnetometer'),
     'field of a level sensor': (partial(Mahony, level=False), 'accuracy'),
     'no field': (partial(Mahony, north=0.0), 'magnetometer'),
-    'declination': (partial(Part, said=turned('z', 5.0)), 'magnetometer'),
+    'declination': (partial(Part, said=partial(product, EAST)), 'magnetometer'),
     'conjugated': (partial(Part, said=lambda q: q * (-1.0, -1.0, -1.0, 1.0)), 'convention'),
     'w first': (partial(Part, said=lambda q: q[[3, 0, 1, 2]]), 'convention'),
     'w first, NED': (partial(Part, said=lambda q: product(NED, q)[[3, 0, 1, 2]]), 'convention'),
@@ -170,7 +157,7 @@ WRONG = {
     'bias gain < 0': (partial(Mahony, learns=-0.02), 'bias'),
     'bias clamped': (partial(Mahony, most=math.radians(0.1)), 'bias'),
     'bias negated': (partial(Part, report=np.negative), 'bias'),
-    'bias in the world': (partial(IntegralInTheWorld, 0.5, 0.5, 0.05), 'bias'),
+    'bias in the world': (partial(Mahony, 0.5, 0.5, 0.05, in_world=True), 'bias'),
     'covariance / 9': (partial(Part, ReferenceFilter, covariance=1.0 / 9.0), 'covariance'),
     'covariance x 50': (partial(Part, ReferenceFilter, covariance=50.0), 'covariance'),
     'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
