@@ -53,7 +53,7 @@ def test_the_names_of_faults_are_twelve_and_the_tables_have_them():
         NAMES - {'nondeterministic'})
 
 
-@pytest.mark.parametrize('name', [*FAST, 'first order', 'no bias', 'no field'])
+@pytest.mark.parametrize('name', [*FAST, 'first order', 'force late', 'no bias', 'no field'])
 def test_a_wrong_filter_is_named_by_its_area_and_nothing_else(report, name):
     found = report(name)
     assert ', '.join(found.faults) == WRONG[name][1], found
