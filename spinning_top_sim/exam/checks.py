@@ -35,7 +35,7 @@ IGNORES = 0.9
 # Of large turns: half of what a step of first order, 2 atan(x / 2), misses.
 TURNS_OFF = LARGE ** 2 / 24.0
 GROWS = 2.0 + GAIN_OFF  # an error that grows slower and slower at most doubles in the second half
-# Steps by which a filter may read force and field late: it has the mean of two, or corrects first.
+# Steps by which filters may read force and field late: those that take a mean, or correct first.
 SHIFTS = 0.0, 0.5, 1.0, -1.0, -0.5
 BIAS_OFF = 0.3          # of a bias: integrals that leak keep as much
 ARM = 0.1, 0.0, 0.0     # of the IMU off the axis [m]
@@ -191,9 +191,9 @@ def clean(exam: Exam) -> Measured:
         field = min(SHIFTS, key=lambda shift: float(np.max(errors(force, shift).whole)))
     whole, kinds = np.degrees(errors(force, field).whole), np.array(exam.motion.kinds[exam.lead:])
     worst = {kind: float(np.max(whole[kinds == kind])) for kind in dict.fromkeys(kinds.tolist())}
-    return Measured(max(worst.values()), f'without noise, and with force and field {force:g} and '
-                    f'{field:g} steps later, the error is ' + ', '.join(
-                        f'{value:.2g} deg ({kind})' for kind, value in worst.items()))
+    return Measured(max(worst.values()), 'without noise the error is ' + ', '.join(
+        f'{value:.2g} deg ({kind})' for kind, value in worst.items()) + (
+            f', with force and field of {force:g} and {field:g} steps later'))
 
 
 def reported_bias(exam: Exam) -> Measured | None:
