@@ -26,6 +26,7 @@ from spinning_top_sim.tools.report import Mark
 
 # Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
+MOVING_DEG = 0.5        # nor in motion, but for means of two samples where a turn begins
 GAIN_OFF = 0.02         # of what should be 1: less than sensors differ in scale
 EXPLAINED = 0.25        # of an effect: what its cause may leave of it
 DELAY = 0.25            # samples: half of what a mean of two steps is late
@@ -186,7 +187,7 @@ def clean(exam: Exam) -> Measured:
         return exam.errors(exam.shifted(force, field).part(slice(exam.lead, None)))
 
     force = field = 0.0
-    if np.max(errors(force, field).whole) > math.radians(CLEAN_DEG):
+    if np.max(errors(force, field).whole) > math.radians(MOVING_DEG):
         force = min(SHIFTS, key=lambda shift: float(np.max(errors(shift, field).tilt)))
         field = min(SHIFTS, key=lambda shift: float(np.max(errors(force, shift).whole)))
     whole, kinds = np.degrees(errors(force, field).whole), np.array(exam.motion.kinds[exam.lead:])
@@ -330,7 +331,7 @@ CHECKS = (
           INPUTS),
     Check('accelerometer', 'tilt_answer', IGNORES, '1: gravity does not lead a tilt back',
           tilt_answer, INPUTS),
-    Check('accuracy', 'clean_deg', CLEAN_DEG, 'largest error without noise', clean,
+    Check('accuracy', 'clean_deg', MOVING_DEG, 'largest error without noise', clean,
           (*ALL, 'integration')),
     Check('bias', 'bias_report_off', BIAS_OFF, 'of a bias, relative', reported_bias, ALL),
     Check('bias', 'bias_growth', GROWS, 'of the tilt by a bias in half of a rest', effect_of_bias,
