@@ -131,7 +131,6 @@ WRONG = {
     'force y x z': (partial(Part, force=lambda v: v[[1, 0, 2]]), 'accelerometer'),
     'force negated': (partial(Part, force=np.negative), 'accelerometer'),
     'force x 1.2': (partial(Part, force=lambda v: v * (1.2, 1.0, 1.0)), 'accelerometer'),
-    'force offset': (partial(Part, force=partial(np.add, (0.0, 0.8, 0.0))), 'accelerometer'),
     'force late': (partial(Part, Mahony, late=(0, 10, 0, 0)), 'accuracy'),
     'no tilt about y': (partial(Mahony, feels=(1.0, 0.0, 1.0)), 'accelerometer'),
     'gain < 0': (partial(Mahony, -0.3), 'accelerometer'),
