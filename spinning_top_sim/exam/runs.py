@@ -97,8 +97,9 @@ class Exam:
     @cached_property
     def ends(self) -> NDArray[np.intp]:
         """The ends of the rests."""
-        rests = np.array([*self.motion.kinds, '']) == 'rests'
-        return np.flatnonzero(rests[:-1] & ~rests[1:]) + 1
+        kinds = np.array([*self.motion.kinds, ''])
+        rests = np.isin(kinds, ('start', 'rests'))
+        return np.flatnonzero(rests[:-1] & (kinds[:-1] != kinds[1:])) + 1
 
     @property
     def plain(self) -> Outcome:
