@@ -26,7 +26,7 @@ from spinning_top_sim.exam import scenes as field
 from spinning_top_sim.exam.adapters import Ahrs, Imufusion, Vqf
 from spinning_top_sim.exam.feeding import InvalidOutputError, feed
 from spinning_top_sim.exam.measures import rmse
-from spinning_top_sim.exam.scored import ScoredRun
+from spinning_top_sim.exam.motions import Scored
 from spinning_top_sim.tools.cli import progress
 
 sys.path.insert(0, str(ROOT / 'examples'))
@@ -51,7 +51,7 @@ DRAWS = 2000
 
 
 @cache
-def trial_of(what: Path | tuple[int, int]) -> ScoredRun:
+def trial_of(what: Path | tuple[int, int]) -> Scored:
     """Return a trial of a file, or of a scene and a seed."""
     if isinstance(what, Path):
         return broad.read_trial(what)

@@ -116,24 +116,15 @@ def test_the_node_ends_with_the_exam():
         exam.wait()
 
 
-def test_a_node_that_does_not_start_or_answer_is_told(run, plain, tmp_path, monkeypatch):
+def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
     with (live.NodeExam('/nope', 'imu/data') as node,
           pytest.raises(feeding.NodeError, match='cannot start /nope')):
         node.start()
     with live.NodeExam(plain(left_out=range(99)), 'imu/data') as node:
         filter_ = node.start()
-        with (monkeypatch.context() as patched,
-              pytest.raises(RuntimeError, match='answers no sample within 1 s')):
-            patched.setattr(live, 'PATIENCE_S', 1.0)
+        monkeypatch.setattr(live, 'PATIENCE_S', 1.0)
+        with pytest.raises(RuntimeError, match='answers no sample within 1 s: must be'):
             filter_.update(run.gyroscope[0], run.accelerometer[0], None, 0.01)
-    other = tmp_path / 'other.py'
-    other.write_text(PLAIN.replace('import Imu', 'import Imu, Range').replace(
-        'publisher(Imu', 'publisher(Range'))
-    with (live.NodeExam(f'{sys.executable} {other}', 'imu/data') as node,
-          pytest.raises(feeding.NodeError, match=r'imu/data has the type sensor_msgs/msg/Range: '
-                                                 'must be sensor_msgs/msg/Imu')):
-        node.start()
-    monkeypatch.setattr(live, 'PATIENCE_S', 1.0)
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
         feeding.feed(node.start, [run])

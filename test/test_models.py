@@ -82,6 +82,7 @@ def test_the_command_writes_a_scene_and_overwrites_nothing(tmp_path, capsys):
     path = tmp_path / 'top.sdf'
     words = ['export', '--model', 'sdf', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]', '-o', str(path)]
     assert main(words) == 0 and main(words) == 1
-    assert capsys.readouterr().err.endswith('top.sdf: File exists, and nothing is overwritten: choose a new name\n')
+    assert capsys.readouterr().err.endswith(
+        'top.sdf: File exists, and nothing is overwritten: choose a new name\n')
     values = parameters.checked({'imu.lever_arm': (0.1, 0.0, 0.2)})
     assert path.read_text(encoding='utf-8') == model(values, 'sdf')

@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
-from spinning_top_sim.exam.broad import examine_data
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.feeding import Filter, feed, feed_apart
 from spinning_top_sim.exam.programs import Program
@@ -40,7 +39,7 @@ from spinning_top_sim.tools.report import Report, printed
 
 # What is examined, and the options that it takes.
 OF_FILTER = 'level', 'imu', 'seeds', 'data'
-KINDS = {'log': ('topic', 'truth', 'heading'), 'node': ('topic', 'level', 'imu', 'seeds'),
+KINDS = {'log': ('topic', 'truth'), 'node': ('topic', 'level', 'imu', 'seeds'),
          'filter': OF_FILTER, 'command': OF_FILTER}
 
 
@@ -57,8 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--topic', help='topic of the attitudes in a log, or of the node')
     add('--truth', help='topic of the true attitudes of the same axes; default: ground_truth/imu')
-    add('--heading', choices=('true',), help='the heading in the log must be right, from true '
-        'north; default: it must be steady')
     add('--data', type=Path, metavar='FOLDER', help='examine with the trials of BROAD in this '
         'folder: readings of a real IMU beside an optical truth (.mat)')
     add('--level', choices=SEEDS, help='level of the exam; default: quick; field: scenes of a '
@@ -96,8 +93,6 @@ def _options(arguments: argparse.Namespace, kind: str) -> dict[str, Any]:
     shown, taken = kind if kind == 'log' else f'--{kind}', KINDS[kind]
     if 'topic' in taken and 'topic' not in options:
         raise ValueError(f'{shown} needs --topic')
-    if 'data' in options and 'data' in taken:
-        shown, taken = '--data', ('data',)
     for name in options:
         if name not in taken:
             raise ValueError(f'--{name} cannot be given with {shown}: must be '
@@ -127,11 +122,7 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
             make_filter()
     elif kind == 'filter':
         make_filter, how, name = _own_filter(subject), feed_apart, None
-
-    def judge(data: Path | None = None, **options: Any) -> Report:
-        exam = examine if data is None else partial(examine_data, folder=data)
-        return exam(make_filter, subject=name, feed=how, **options)
-    return judge
+    return partial(examine, make_filter, subject=name, feed=how)
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:

@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exam of a filter: the loop over the checks."""
+"""The exam of a filter: the loop over the checks, or over runs whose errors count."""
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.exam import motions, scenes
+import numpy as np
+
+from spinning_top_sim.exam import measures, motions, scenes
+from spinning_top_sim.exam.broad import read_trial, trials_in
 from spinning_top_sim.exam.checks import CHECKS
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, feed_apart
+from spinning_top_sim.exam.motions import Scored
 from spinning_top_sim.exam.runs import Exam
-from spinning_top_sim.exam.scored import report_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
@@ -21,8 +26,8 @@ SEEDS = {'quick': 3, 'field': 1}     # of the noisy runs, of the scenes
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
-            seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
-            feed: Feed = feed_apart,
+            seeds: int | Iterable[int] | None = None, *, data: str | Path | None = None,
+            subject: str | None = None, feed: Feed = feed_apart,
             show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
     Examine an attitude filter.
@@ -45,6 +50,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
         Seeds of the noisy runs, or their number; default: 3, of 'field' 1.
+    data : path, optional
+        A folder with trials of BROAD (.mat), which take the place of a level; each is fed from its
+        first sample on.
     subject : str, optional
         Name in the report; default: that of the filter's class.
     feed : callable, optional
@@ -59,15 +67,11 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Raises
     ------
-    TypeError
-        If `make_filter` cannot be called, such as a filter itself.
     ValueError
-        If the level, a parameter or a seed is not allowed.
+        If the level, a parameter or a seed is not allowed, or there is no trial in the folder.
     """
-    if not callable(make_filter):
-        raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
-                        'filter, a function that returns a new one, or one of '
-                        "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
+    if data is not None and (level, imu, seeds) != ('quick', None, None):
+        raise ValueError('data cannot be given with level, imu or seeds')
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')
@@ -77,6 +81,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     if not numbers or min(numbers) < 0:
         raise ValueError(f'seeds = {seeds!r}: must be a positive number, or integers >= 0')
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
+    if data is not None:
+        return report_of(make_filter, [partial(read_trial, path) for path in trials_in(data)],
+                         'data', subject, feed, show)
     if level == 'quick':
         return _sit(Exam(partial(feed, make_filter), {**motions.CALIBRATED, **values}, numbers),
                     subject, show)
@@ -129,3 +136,44 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
         notes.append('the magnetometer changes nothing: tilt and steady heading are judged')
     noise = exam.noise[:-1] if 'noise' in exam.told else []
     return Report(subject, found, marks, notes, noise, absolute)
+
+
+def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], Scored]], kind: str,
+              subject: str, feed: Feed, show: Callable[[float, float], object]) -> Report:
+    """
+    Return the report on a filter in runs, made one by one; names of marks begin with `kind`.
+
+    The whole error is judged where it counts, of a filter that does not use the field the tilt.
+    """
+    outcomes, failed, whole = [], [], True
+    for done, make_run in enumerate(runs):
+        show(done, len(runs))
+        run, counts = make_run()
+        try:
+            if not done:
+                part = run.part(slice(1000))        # shows whether it uses the field
+                one, other = feed(make_filter, [part, replace(
+                    part, magnetometer=part.magnetometer[:, [1, 2, 0]])])
+                whole = measures.differ(one.estimates, other.estimates)
+            outcomes.append(feed(make_filter, [run])[0].part(counts))
+        except InvalidOutputError as error:
+            failed.append(str(error))
+    show(len(runs), len(runs))
+    faults = [Finding('invalid_output', '; '.join(failed))] if failed else []
+    if not outcomes:
+        return Report(subject, faults)
+    errors = [measures.rmse(one.estimates, one.run.truth) for one in outcomes]
+    total, heading, tilt = np.mean(errors, axis=0).tolist()
+    judged, name = (total, 'error') if whole else (tilt, 'tilt error')
+    if judged > measures.USELESS_DEG:
+        faults.append(Finding('accuracy', f'the mean {name} is {judged:.3g} deg', judged))
+    limits = (measures.USELESS_DEG, math.nan) if whole else (math.nan, measures.USELESS_DEG)
+    marks = {f'{kind}_rms_deg': Mark(total, limits[0], 'in motion, mean over the runs'),
+             f'{kind}_heading_rms_deg': Mark(heading, meaning='heading alone'),
+             f'{kind}_tilt_rms_deg': Mark(tilt, limits[1], 'tilt alone')}
+    names = [one.run.name for one in outcomes]
+    for name in dict.fromkeys(names):
+        of_run = [error[0] for error, other in zip(errors, names, strict=True) if other == name]
+        marks[f'{kind}_rms_{name}_deg'] = Mark(float(np.mean(of_run)))
+    return Report(subject, faults, marks, [] if whole else [
+        'the magnetometer changes nothing: the filter is judged by its tilt'], outcomes, whole)

@@ -3,7 +3,7 @@
 The exam of a log: attitudes that a node has published, compared with the truth.
 
 The filter cannot get the readings again, so only the attitudes are judged: their convention,
-wrong stamps, the covariance and gross errors.
+wrong stamps, the covariance and gross errors.  The heading must be steady.
 """
 
 import math
@@ -43,8 +43,7 @@ class Stamped(NamedTuple):
     covariances: Reals
 
 
-def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
-                heading: str | None = None) -> Report:
+def examine_log(path: str | Path, topic: str, truth: str = TRUTH) -> Report:
     """
     Examine the attitudes q(world <- sensor) of a topic of an MCAP file.
 
@@ -56,8 +55,6 @@ def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
         Of the attitudes; its type must be one of LAYOUTS.
     truth : str, optional
         Topic of the true attitudes of the same axes.
-    heading : {'true'}, optional
-        Whether the heading counts from true north; by default it must be steady.
 
     Raises
     ------
@@ -74,8 +71,8 @@ def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
         return Report(subject, [Finding('invalid_output', 'the message of '
                                         f'{stamp_text(int(said.stamps_ns[wrong[0]]))} s: '
                                         f'{wrong[1]}')], notes=notes)
-    outcome = _beside(one_line(topic), said, true)
-    return replace(_judge(subject, outcome, heading == 'true'), notes=notes)
+    outcome, before = _beside(one_line(topic), said, true)
+    return replace(_judge(subject, outcome, before), notes=notes)
 
 
 def _read(reader: LogReader, name: str) -> Stamped:
@@ -100,68 +97,64 @@ def _read(reader: LogReader, name: str) -> Stamped:
     return Stamped(stamps_ns, quaternions[first], covariances[first])
 
 
-def _beside(name: str, said: Stamped, true: Stamped) -> Outcome:
-    """Return the estimates with the truth at their stamps, interpolated."""
-    after = np.clip(np.searchsorted(true.stamps_ns, said.stamps_ns), 1, len(true.stamps_ns) - 1)
-    chosen = ((said.stamps_ns >= true.stamps_ns[0]) & (said.stamps_ns <= true.stamps_ns[-1])
-              & (true.stamps_ns[after] - true.stamps_ns[after - 1] <= LONGEST_GAP_S * 1e9))
-    if np.count_nonzero(chosen) < FEWEST:
-        raise ValueError(f'{name} has {np.count_nonzero(chosen)} attitudes at times of the truth: '
-                         f'must have {FEWEST} at least')
-    times, t = ((stamps - true.stamps_ns[0]) * 1e-9
-                for stamps in (true.stamps_ns, said.stamps_ns[chosen]))
-    attitudes = Rotation.from_quat(true.quaternions)
-    # Central differences.
-    step = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / np.diff(times)[:, np.newaxis]
-    rates = np.stack([np.interp(t, 0.5 * (times[1:] + times[:-1]), column) for column in step.T],
-                     axis=1)
+def _beside(name: str, said: Stamped, true: Stamped) -> tuple[Outcome, Reals]:
+    """Return the estimates with the truth at their stamps, and the truth one step before."""
     # The period of the filter, which may be shorter than that of the truth.
-    dt = np.full(len(t), float(np.median(np.diff(said.stamps_ns))) * 1e-9)
-    unknown = np.full((len(t), 3), np.nan)
-    return Outcome(Run(name, dt, Slerp(times, attitudes)(t).as_quat(), rates, unknown, unknown),
-                   said.quaternions[chosen], said.covariances[chosen], unknown)
+    step_ns = float(np.median(np.diff(said.stamps_ns)))
+    after = np.clip(np.searchsorted(true.stamps_ns, said.stamps_ns), 1, len(true.stamps_ns) - 1)
+    chosen = ((said.stamps_ns - step_ns >= true.stamps_ns[0])
+              & (said.stamps_ns <= true.stamps_ns[-1])
+              & (true.stamps_ns[after] - true.stamps_ns[after - 1] <= LONGEST_GAP_S * 1e9))
+    count = int(np.count_nonzero(chosen))
+    if count < FEWEST:
+        raise ValueError(f'{name} has {count} attitudes at times of the truth: must have {FEWEST} '
+                         'at least')
+    times, t = (stamps - true.stamps_ns[0] for stamps in (true.stamps_ns, said.stamps_ns[chosen]))
+    attitude = Slerp(times, Rotation.from_quat(true.quaternions))
+    unknown = np.full((count, 3), np.nan)
+    run = Run(name, np.full(count, 1e-9 * step_ns), attitude(t).as_quat(), *(3 * [unknown]))
+    return (Outcome(run, said.quaternions[chosen], said.covariances[chosen], unknown),
+            attitude(t - step_ns).as_quat())
 
 
-def _delay(outcome: Outcome, absolute: bool) -> tuple[float, float, float]:
-    """Fit errors e = -s w to rates w; return s [s], and the rms of e without and with it [rad]."""
-    truth, estimates = outcome.run.truth, Rotation.from_quat(outcome.estimates)
-    rates = Rotation.from_quat(truth).apply(outcome.run.gyroscope)
-    if not absolute:
-        heading = errors_of(outcome.estimates, truth).heading
-        estimates = Rotation.from_euler('z', -np.angle(np.mean(np.exp(1j * heading)))) * estimates
-    errors = turns(truth, estimates.as_quat())
-    if not absolute:
-        errors[:, 2] -= np.mean(errors[:, 2])
-        rates[:, 2] -= np.mean(rates[:, 2])
-    seconds = -float(np.vdot(rates, errors) / max(np.vdot(rates, rates), 1e-300))
-    return seconds, rms(errors), rms(errors + seconds * rates)
+def _delay(outcome: Outcome, before: Reals) -> tuple[float, float, float]:
+    """Fit errors as a delay; return its number of steps, and the rms without and with it [rad]."""
+    truth = outcome.run.truth
+    errors, of_a_step = turns(truth, outcome.estimates), turns(truth, before)
+    for one in (errors, of_a_step):
+        one[:, 2] -= np.mean(one[:, 2])
+    late = float(np.vdot(of_a_step, errors)) / max(float(np.vdot(of_a_step, of_a_step)), 1e-300)
+    return late, rms(errors), rms(errors - late * of_a_step)
 
 
-def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
+def _judge(subject: str, outcome: Outcome, before: Reals) -> Report:
     """Find the convention, the delay, and what is left, in the second half."""
-    settled = outcome.part(slice(len(outcome.run.dt) // 2, None))
-    rows = np.linspace(0, len(settled.run.dt) - 1, FEWEST // 2, dtype=int)
-    best = conventions.best(settled.estimates[rows], settled.run.truth[rows],
-                            steady=not absolute)
-    findings, name = [], best.convention.name
+    half = slice(len(outcome.run.dt) // 2, None)
+    truth = outcome.run.truth[half]
+    rows = np.linspace(0, len(truth) - 1, FEWEST // 2, dtype=int)
+    best = conventions.best(outcome.estimates[half][rows], truth[rows], steady=True)
+    findings, name, estimates = [], best.convention.name, outcome.estimates
     if name and best.after < EXPLAINED * best.before:
         findings.append(Finding('convention', f'read as {name}, the error falls from '
                                 f'{degrees(best.before)} to {degrees(best.after)}; all measures '
                                 'are those after this correction'))
-        outcome, settled = (replace(one, estimates=best.convention.undo(one.estimates))
-                            for one in (outcome, settled))
-    seconds, before, after = _delay(settled, absolute)
-    late = seconds / float(outcome.run.dt[0])
-    if not EARLY <= late <= LATE and after < EXPLAINED * before:
+        estimates = best.convention.undo(estimates)
+    mean = float(np.angle(np.mean(np.exp(1j * errors_of(estimates[half], truth).heading))))
+    turn = Rotation.from_euler('z', -mean)
+    outcome = replace(outcome, estimates=(turn * Rotation.from_quat(estimates)).as_quat())
+    settled = outcome.part(half)
+    late, error, left = _delay(settled, before[half])
+    seconds = late * float(outcome.run.dt[0])
+    if not EARLY <= late <= LATE and left < EXPLAINED * error:
         findings.append(Finding(
             'timing', f'the attitude is {abs(1e3 * seconds):.3g} ms '
             f'{"behind" if late > 0.0 else "ahead of"} its stamp: shifted by that, the error '
-            f'falls from {degrees(before)} to {degrees(after)}', seconds))
+            f'falls from {degrees(error)} to {degrees(left)}', seconds))
     errors = errors_of(settled.estimates, settled.run.truth)
-    errors = errors if absolute else errors.about_mean()
     value, ratio = rms(errors.whole), nees_of([settled])
     marks = {'tilt_rms_deg': Mark(math.degrees(rms(errors.tilt)), meaning='in the second half'),
-             'heading_rms_deg': Mark(math.degrees(rms(errors.heading))),
+             'heading_rms_deg': Mark(math.degrees(rms(errors.heading)), meaning='about its mean'),
+             'heading_mean_deg': Mark(math.degrees(mean), meaning='from true north'),
              'error_rms_deg': Mark(math.degrees(value), USELESS_DEG),
              'stamp_offset_s': Mark(seconds, meaning='> 0: late')}
     if not findings and math.degrees(value) > USELESS_DEG:
@@ -171,4 +164,4 @@ def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
         if not findings and not 1.0 / NEES_OFF[1] <= ratio <= NEES_OFF[0]:
             findings.append(Finding('covariance', f'the squared error of the tilt is {ratio:.3g} '
                                     'times what the covariance says'))
-    return Report(subject, findings, marks, (), [outcome], absolute)
+    return Report(subject, findings, marks, (), [outcome])

@@ -92,11 +92,11 @@ def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:
     """
     Return the attitude in which `up` is vertical and the field has no east component (TRIAD).
 
-    up, magnetometer : (3,) or (n, 3); without a field (3,), and the heading is arbitrary
+    up, magnetometer : (3,); without a field the heading is arbitrary
     """
-    z = up / np.linalg.norm(up, axis=-1, keepdims=True)
-    north = magnetometer if magnetometer is not None else np.eye(3)[np.argmin(np.abs(z))]
-    x = np.cross(north, z)
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    quaternion: Reals = Rotation.from_matrix(np.stack((x, np.cross(z, x), z), axis=-2)).as_quat()
+    north = magnetometer if magnetometer is not None else np.eye(3)[np.argmin(np.abs(up))]
+    x = np.cross(north, up)
+    rows = np.stack((x, np.cross(up, x), up))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    quaternion: Reals = Rotation.from_matrix(rows).as_quat()
     return quaternion

@@ -9,7 +9,7 @@ the sensor is vertical, no heading is north, and no attitude is the identity.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,35 +80,30 @@ class Run:
         return replace(self, magnetometer=np.full_like(self.magnetometer, np.nan))
 
 
-class Part(NamedTuple):
-    """Samples of a motion: 'rests', 'turns', 'fast turns', 'slow turns', 'top'."""
-
-    kind: str
-    begin: int
-    end: int
+# A run, and the samples of it whose errors count.
+Scored = tuple[Run, NDArray[np.intp]]
 
 
 class Motion:
-    """A motion that is put together from rests and turns, from an attitude [deg] on."""
+    """
+    A motion that is put together from rests and turns, from an attitude [deg] on.
+
+    kinds : of its samples: 'start', 'rests', 'turns', 'fast turns', 'slow turns', 'top'
+    """
 
     def __init__(self, start: Sequence[float]) -> None:
         self._attitudes = [Rotation.from_euler('ZYX', [start], degrees=True)]
-        self.parts: list[Part] = []
-
-    def of(self, kind: str) -> list[Part]:
-        """Return the parts of a kind."""
-        return [part for part in self.parts if part.kind == kind]
+        self.kinds: list[str] = []
 
     def add(self, kind: str, attitudes: Rotation) -> 'Motion':
         """Add attitudes at the ends of steps."""
-        begin = self.parts[-1].end if self.parts else 0
-        self.parts.append(Part(kind, begin, begin + len(attitudes)))
+        self.kinds += [kind] * len(attitudes)
         self._attitudes.append(attitudes)
         return self
 
-    def rest(self, seconds: float) -> 'Motion':
+    def rest(self, seconds: float, kind: str = 'rests') -> 'Motion':
         """Add a rest."""
-        return self.add('rests', self._attitudes[-1][[-1] * round(seconds * RATE)])
+        return self.add(kind, self._attitudes[-1][[-1] * round(seconds * RATE)])
 
     def turn(self, vector: Sequence[float] | Reals, rate: float = 2.6,
              kind: str = 'turns') -> 'Motion':
@@ -137,7 +132,7 @@ class Motion:
 
 def excitation(lead_s: float) -> Motion:
     """Return turns about each axis between rests, and the motion of a top."""
-    motion = Motion(STARTS[0]).rest(lead_s)
+    motion = Motion(STARTS[0]).rest(lead_s, 'start')
     for kind, axis, angle, rate in TURNS:
         motion.rest(REST_S).turn(np.radians(angle) * np.eye(3)[axis], rate, kind)
     return motion.rest(REST_S).top(TOP_S).rest(REST_S)

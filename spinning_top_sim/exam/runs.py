@@ -52,14 +52,12 @@ class Exam:
     def outcomes(self, name: str, make_runs: Callable[[], Sequence[Run]]) -> list[Outcome]:
         """Return the outcomes of runs in our convention; those of a name are fed once."""
         if name not in self.told:
-            self.told[name] = self._feed([
-                run if run.name.startswith(name) else replace(run, name=name)
-                for run in make_runs()])
+            self.told[name] = self._feed(make_runs())
         return list(map(self.ours, self.told[name]))
 
     def outcome(self, name: str, run: Run) -> Outcome:
         """Return the outcome of a run; see `outcomes`."""
-        return self.outcomes(name, lambda: [run])[0]
+        return self.outcomes(name, lambda: [replace(run, name=name)])[0]
 
     def ours(self, told: Outcome) -> Outcome:
         """Return an outcome in our convention."""
@@ -99,12 +97,24 @@ class Exam:
     @cached_property
     def ends(self) -> NDArray[np.intp]:
         """The ends of the rests."""
-        return np.array([part.end for part in self.motion.of('rests')])
+        kinds = np.array([*self.motion.kinds, ''])
+        rests = np.isin(kinds, ('start', 'rests'))
+        return np.flatnonzero(rests[:-1] & (kinds[:-1] != kinds[1:])) + 1
 
     @property
     def plain(self) -> Outcome:
         """The excitation."""
         return self.outcome('excitation', self.run)
+
+    def shifted(self, force: float, field: float) -> Outcome:
+        """Return the excitation with force and field of so many steps later."""
+        if not (force or field):
+            return self.plain
+        steps, run = np.arange(len(self.run.dt)), self.run
+        forces, fields = (np.stack([np.interp(steps + by, steps, one) for one in rows.T], axis=1)
+                          for rows, by in ((run.accelerometer, force), (run.magnetometer, field)))
+        return self.outcome(f'shifted by {force:g}, {field:g}', replace(
+            run, accelerometer=forces, magnetometer=fields))
 
     @property
     def still(self) -> Outcome:
@@ -122,7 +132,8 @@ class Exam:
     def biased(self) -> Outcome:
         """A bias in a rest, and in one in which its axes of the world have other signs."""
         def make() -> list[Run]:
-            motion = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S)
+            # Slowly, so that a bias feels little of a field that is read late.
+            motion = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0), 0.5).rest(BIAS_S)
             run = motion.run('bias')
             return [replace(run, gyroscope=run.gyroscope + BIAS)]
         return self.outcomes('bias', make)[0]
@@ -146,7 +157,12 @@ class Exam:
         gyroscope[steps] += turns / dt[steps, np.newaxis]
         return replace(run, gyroscope=gyroscope, dt=dt)
 
-    def answers(self, name: str = 'turns', size: float = SMALL,
+    @cached_property
+    def small_turns(self) -> tuple[Reals, Reals]:
+        """The answers to SMALL kicks in equal steps."""
+        return self.answers('turns', SMALL)
+
+    def answers(self, name: str, size: float,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
         """
         Return kicks about the vertical (n, 3), and how they move attitudes (n, ANSWER, 3).

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam.motions import GRAVITY, Reals, Run, readings
-from spinning_top_sim.exam.scored import ScoredRun
+from spinning_top_sim.exam.motions import GRAVITY, Reals, Run, Scored, readings
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.felt import Vibration
 
@@ -74,7 +73,7 @@ SCENES = (
         'mag.disturbance.body': (0.0, 1e3, -2e-6, 5e-7, 9e-6)}))
 
 
-def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
+def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Scored:
     """
     Return a scene as an IMU reads it.  Raises ValueError for parameters not allowed.
 
@@ -89,7 +88,7 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
                          turns.inv().apply(acceleration + UP))
     step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
     run = Run(scene.name, step, turns[1::2].as_quat(), *readings)
-    return ScoredRun(run, np.flatnonzero(moves[1::2] > 0.5))
+    return run, np.flatnonzero(moves[1::2] > 0.5)
 
 
 def _device(random: np.random.Generator, scene: Scene,

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Filters that are right, and filters with one mistake each and the faults that may be named."""
 
-import importlib.util
 import math
+import runpy
 from collections import deque
 from functools import partial
+from operator import itemgetter
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,10 +15,7 @@ from helpers.reference import ROOT
 from spinning_top_sim.exam.adapters import Vqf
 from spinning_top_sim.exam.measures import from_two_vectors
 
-_spec = importlib.util.spec_from_file_location(
-    'reference_filter', ROOT / 'examples/reference_filter.py')
-reference = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(reference)
+reference = SimpleNamespace(**runpy.run_path(str(ROOT / 'examples/reference_filter.py')))
 ReferenceFilter, product = reference.ReferenceFilter, reference.product
 
 
@@ -24,27 +23,22 @@ class Part:
     """Another filter, of which something is taken for what it is not."""
 
     def __init__(self, make=Vqf, rates=None, force=None, field=None, said=None, step=None,
-                 late=(0, 0, 0, 0), smooth=(0.0, 0.0, 0.0), report=None, covariance=None):
+                 late=(0, 0, 0, 0), taken=itemgetter(0), report=None, covariance=None):
         self._filter = make()
         self._maps = [one or (lambda v: v) for one in (rates, force, field, said)]
         self._step, self._report, self._covariance = step or (lambda dt: dt), report, covariance
-        self._lines = [deque(maxlen=n + 1) for n in late]
-        self._smooth, self._smoothed = (*smooth, 0.0), [None] * 4
+        self._lines, self._taken = [deque(maxlen=n + 1) for n in late], taken
 
-    def _read(self, k, value, dt):
+    def _read(self, k, value):
         if value is None:
             return None
         self._lines[k].append(self._maps[k](value))
-        value, before = self._lines[k][0], self._smoothed[k]
-        if self._smooth[k] and before is not None:
-            value = before + dt / (dt + self._smooth[k]) * (value - before)
-        self._smoothed[k] = value
-        return value
+        return self._taken(self._lines[k])
 
     def update(self, *readings):
         *sensors, dt = readings
-        read = [self._read(k, value, dt) for k, value in enumerate(sensors)]
-        return self._read(3, self._filter.update(*read, self._step(dt)), dt)
+        read = [self._read(k, value) for k, value in enumerate(sensors)]
+        return self._read(3, self._filter.update(*read, self._step(dt)))
 
     @property
     def bias(self):
@@ -73,11 +67,12 @@ class Mahony:
     """A filter of Mahony (2008): gains of tilt, heading [1/s] and bias [1/s^2]."""
 
     def __init__(self, up=0.3, north=0.3, learns=0.02, advance=body, triad=True, first=False,
-                 number=np.float64, level=True, most=np.inf, feels=(1.0, 1.0, 1.0), six=False):
+                 number=np.float64, level=True, most=np.inf, feels=(1.0, 1.0, 1.0), six=False,
+                 in_world=False):
         self._gains, self._advance, self._triad, self._first = (
             (up, north, learns), advance, triad, first)
         self._number, self._level, self._most, self._feels = number, level, most, feels
-        self._six, self._q, self.bias = six, None, np.zeros(3)
+        self._six, self._in_world, self._q, self.bias = six, in_world, None, np.zeros(3)
 
     def _turn(self, a, m, dt):
         up, north, learns = self._gains
@@ -95,7 +90,7 @@ class Mahony:
         return e * dt
 
     def update(self, w, a, m, dt):
-        m = None if self._six else m
+        before, m = self._q, None if self._six else m
         if self._q is None:
             self._q = from_two_vectors(a, m) if self._triad else np.array((0.0, 0.0, 0.0, 1.0))
         elif self._first:       # corrects by the force of the end before it turns
@@ -105,40 +100,12 @@ class Mahony:
             self._q = body(self._q, self._turn(a, m, dt))
         self._q = self._q.astype(self._number).astype(float)
         self._q /= math.sqrt(self._q @ self._q)
+        if self._in_world and before is not None:       # the integral is in axes of the world
+            self.bias = reference.matrix_of(self._q).T @ reference.matrix_of(before) @ self.bias
         return self._q.copy()
 
 
-class IntegralInTheWorld(Mahony):
-    """Keeps its integral in axes of the world, and says it in those of the sensor."""
-
-    def update(self, *readings):
-        before = self._q
-        said = super().update(*readings)
-        if before is not None:
-            turn = reference.matrix_of(said).T @ reference.matrix_of(before)
-            self.bias = turn @ self.bias
-        return said
-
-
-def axes(*rows):
-    """Return what reads other axes: numbers from 1 on, negative where the sign is changed."""
-    chosen, signs = np.abs(rows) - 1, np.sign(rows)
-    return lambda v: signs * v[chosen]
-
-
-def scaled(*by):
-    return lambda v: np.array(by) * v
-
-
-def added(*offset):
-    return lambda v: v + offset
-
-
-def turned(axis, deg):
-    q = Rotation.from_euler(axis, deg, degrees=True).as_quat()
-    return partial(product, q)
-
-
+EAST = Rotation.from_euler('z', 5.0, degrees=True).as_quat()
 NED = Rotation.from_matrix([(0, 1, 0), (1, 0, 0), (0, 0, -1)]).as_quat()
 RIGHT = {
     'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False),
@@ -149,39 +116,38 @@ RIGHT = {
     'mahony, float32': partial(Mahony, number=np.float32),
     'mahony, from the identity': partial(Mahony, triad=False),
     'mahony, slow from the identity': partial(Mahony, 0.1, 0.1, 0.01, triad=False),
-    'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True)}
+    'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True),
+    'mahony, means of two': partial(Part, partial(Mahony, 1.0, 1.0, 0.1), late=(0, 1, 1, 0),
+                                    taken=partial(np.mean, axis=0)),
+    'mahony, field a step late': partial(Part, partial(Mahony, 3.0, 3.0, 0.5),
+                                         late=(0, 0, 1, 0))}
 # Each with the faults that may be named.
 WRONG = {
-    'rates y x z': (partial(Part, rates=axes(2, 1, 3)), 'gyroscope'),
+    'rates y x z': (partial(Part, rates=lambda v: v[[1, 0, 2]]), 'gyroscope'),
     'rates negated': (partial(Part, rates=np.negative), 'gyroscope'),
-    'rates x 1.05': (partial(Part, rates=scaled(1.05, 1.0, 1.0)), 'gyroscope'),
-    'rates x 1.015': (partial(Part, Mahony, rates=scaled(*3 * (1.015,))), 'accuracy'),
-    'rates in deg': (partial(Part, rates=np.radians), 'gyroscope'),
+    'rates x 1.05': (partial(Part, rates=lambda v: v * (1.05, 1.0, 1.0)), 'gyroscope'),
+    'rates x 1.015': (partial(Part, Mahony, rates=lambda v: 1.015 * v), 'accuracy'),
     'rates clipped': (partial(Part, rates=lambda v: np.clip(v, -8.0, 8.0)), 'gyroscope'),
     'rates late': (partial(Part, late=(5, 0, 0, 0)), 'timing'),
-    'rates smoothed': (partial(Part, smooth=(0.05, 0.0, 0.0)), 'timing'),
     'slow turns dropped': (partial(Part, Mahony, rates=lambda v: v * (v @ v > 0.04)), 'accuracy'),
-    'force y x z': (partial(Part, force=axes(2, 1, 3)), 'accelerometer'),
+    'force y x z': (partial(Part, force=lambda v: v[[1, 0, 2]]), 'accelerometer'),
     'force negated': (partial(Part, force=np.negative), 'accelerometer'),
-    'force x 1.2': (partial(Part, force=scaled(1.2, 1.0, 1.0)), 'accelerometer'),
-    'force offset': (partial(Part, force=added(0.0, 0.8, 0.0)), 'accelerometer'),
-    'force smoothed': (partial(Part, Mahony, smooth=(0.0, 0.3, 0.0)), 'accuracy'),
+    'force x 1.2': (partial(Part, force=lambda v: v * (1.2, 1.0, 1.0)), 'accelerometer'),
+    'force late': (partial(Part, Mahony, late=(0, 10, 0, 0)), 'accuracy'),
     'no tilt about y': (partial(Mahony, feels=(1.0, 0.0, 1.0)), 'accelerometer'),
     'gain < 0': (partial(Mahony, -0.3), 'accelerometer'),
     'no gravity': (partial(Mahony, 0.0), 'accelerometer'),
-    'field y x z': (partial(Part, field=axes(2, 1, 3)), 'magnetometer'),
-    'hard iron': (partial(Part, field=added(1e-5, 0.0, 0.0)), 'magnetometer'),
+    'field y x z': (partial(Part, field=lambda v: v[[1, 0, 2]]), 'magnetometer'),
+    'hard iron': (partial(Part, field=partial(np.add, (1e-5, 0.0, 0.0))), 'magnetometer'),
     'field of a level sensor': (partial(Mahony, level=False), 'accuracy'),
     'no field': (partial(Mahony, north=0.0), 'magnetometer'),
-    'declination': (partial(Part, said=turned('z', 5.0)), 'magnetometer'),
+    'declination': (partial(Part, said=partial(product, EAST)), 'magnetometer'),
     'conjugated': (partial(Part, said=lambda q: q * (-1.0, -1.0, -1.0, 1.0)), 'convention'),
     'w first': (partial(Part, said=lambda q: q[[3, 0, 1, 2]]), 'convention'),
     'w first, NED': (partial(Part, said=lambda q: product(NED, q)[[3, 0, 1, 2]]), 'convention'),
-    'vector x y -z': (partial(Part, said=lambda q: q * (1.0, 1.0, -1.0, 1.0)), 'convention'),
     'vector positive': (partial(Part, said=np.abs), 'accuracy'),
     'rounded': (partial(Part, said=lambda q: np.round(q, 3) / np.linalg.norm(np.round(q, 3))),
                 'accuracy'),
-    'attitude late': (partial(Part, late=(0, 0, 0, 5)), 'timing'),
     'one step late': (partial(Part, late=(0, 0, 0, 1)), 'timing'),
     'dt of 100 Hz': (partial(Part, Mahony, step=lambda dt: 0.01), 'timing'),
     'wrong side': (partial(Mahony, advance=world), 'accuracy'),
@@ -191,7 +157,7 @@ WRONG = {
     'bias gain < 0': (partial(Mahony, learns=-0.02), 'bias'),
     'bias clamped': (partial(Mahony, most=math.radians(0.1)), 'bias'),
     'bias negated': (partial(Part, report=np.negative), 'bias'),
-    'bias in the world': (partial(IntegralInTheWorld, 0.5, 0.5, 0.05), 'bias'),
+    'bias in the world': (partial(Mahony, 0.5, 0.5, 0.05, in_world=True), 'bias'),
     'covariance / 16': (partial(Part, ReferenceFilter, covariance=1.0 / 16.0), 'covariance'),
     'covariance x 50': (partial(Part, ReferenceFilter, covariance=50.0), 'covariance'),
     'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
