@@ -37,10 +37,21 @@ NAME, FRAME = 'examine', 'imu_link'
 
 def examine_node(command: str, topic: str, **options: Any) -> Report:
     """
-    Examine a ROS node that `command` starts for each run, without a shell; options of `examine`.
+    Examine a ROS node that `command` starts for each run, without a shell.
 
-    Its attitudes are sensor_msgs/Imu on `topic`, each with the stamp of its sample.  Raises
-    NodeError if other nodes publish on its topics, or messages are lost.
+    Parameters
+    ----------
+    command : str
+        Starts the node.
+    topic : str
+        That of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
+    **options
+        Of `examine`.
+
+    Raises
+    ------
+    NodeError
+        If other nodes publish on its topics, or messages are lost.
     """
     with NodeExam(command, topic) as node:
         return examine(node.start, subject=command, feed=feed, **options)

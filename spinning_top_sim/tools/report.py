@@ -14,9 +14,14 @@ class Finding(NamedTuple):
     """
     A fault that was found.
 
-    name : as in docs/exam.md or docs/grade.md
-    evidence : what was measured, in one line
-    number : the measured value, such as a lag or a coefficient; NaN where there is none
+    Parameters
+    ----------
+    name : str
+        As in docs/exam.md or docs/grade.md.
+    evidence : str
+        What was measured, in one line.
+    number : float
+        The measured value, such as a lag or a coefficient; NaN where there is none.
     """
 
     name: str
@@ -28,9 +33,14 @@ class Mark(NamedTuple):
     """
     A measure.
 
-    value : NaN: could not be measured
-    limit : from which on it is a fault; NaN: none
-    meaning : what it is, in a few words
+    Parameters
+    ----------
+    value : float
+        NaN: could not be measured.
+    limit : float
+        From which on it is a fault; NaN: none.
+    meaning : str
+        What it is, in a few words.
     """
 
     value: float
@@ -46,13 +56,22 @@ class Report:
     """
     A judgement; `str(report)` is a table.
 
-    subject : name of what was judged
-    found : faults with their evidence, the most important first
-    marks : by name
-    notes : what was read
-    outcomes : what the marks are computed from, for figures
-    absolute : whether the headings of the outcomes are judged against north, or about their mean
-    unjudged : what was not judged, and why: `passed` says nothing of it
+    Parameters
+    ----------
+    subject : str
+        Name of what was judged.
+    found : sequence of Finding
+        Faults with their evidence, the most important first.
+    marks : mapping of Mark
+        By name.
+    notes : sequence of str
+        What was read.
+    outcomes : sequence
+        What the marks are computed from, for figures.
+    absolute : bool
+        Whether the headings of the outcomes are judged against north, or about their mean.
+    unjudged : sequence of str
+        What was not judged, and why: `passed` says nothing of it.
     """
 
     subject: str
