@@ -109,9 +109,9 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
         attitude.product(rotation, (0.5 * w1, 0.5 * w2, 0.5 * w3, 0.0 * w3)),
         attitude.rotated_back((-x, -y, -z, w), (f1, f2, f3)), (w1, w2, w3), (f1, f2, f3)])
     sums = np.zeros((len(derivatives), len(times_ns)))
-    found = Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
     for node, (_, weight) in enumerate(rule):
         sums += weight * derivatives[:, node]
+    found = Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
     found.rotation[3] += 1.0            # w of the identity
     if angle >= LEAST_ANGLE:
         seconds = 1e-9 * length_ns

@@ -78,7 +78,8 @@ class States:
 
     def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
-        self._constant_l3: Any = start.l3       # (n,) where it is measured
+        # (n,) where it is measured.  Columns that read it or `start` stand in `_Joined`, too.
+        self._constant_l3: Any = start.l3
 
     def __len__(self) -> int:
         return self._n

@@ -147,6 +147,7 @@ class LiveSimulation(Simulation):
             output.take(NEVER_NS)
             if output.is_used:
                 outputs_of.setdefault(output.channel.grid, {})[output.channel] = output
+        # Without takers the motion alone goes on, as a grid without outputs.
         self._grids = [_Progress(self.sent_ns, FIRST_SPAN_NS, outputs)
                        for outputs in outputs_of.values()] or [self._motion]
         self._ready_ns = self.sent_ns       # up to here all messages are sent or wait

@@ -116,6 +116,7 @@ def _normal(seed: int, kind: Kind, part: Part, columns: int, block: int,
             count: int = DRAWN_TOGETHER, of_ends: bool = False) -> NDArray[np.float64]:
     """Return standard normal numbers (count, columns) that depend on the arguments alone."""
     # The counter is part of the format of logs: it never changes, whatever Kind or Part is added.
+    # There were five parts when it was fixed.
     more, place = divmod(int(part), 5)
     counter = [0, 2 * more + int(of_ends), 5 * int(kind) + place, block]
     return np.random.Generator(np.random.Philox(key=seed, counter=counter)

@@ -62,7 +62,8 @@ class Simulation:
         self.values_at_start, self.values_in_effect = dict(values), dict(values)
         self.history: list[Event] = []
         self.sent_ns = -1
-        # The trace of the markers and late fixes reach back across events.
+        # The trace of the markers and late fixes look back at the pivot, across events; only
+        # readings look back at states, by `Imu.memory_ns`.
         self._keep_ns = max(round(values[name] * NANOSECONDS) for name in (
             'markers.trace_length', 'gnss.latency'))
 
@@ -122,7 +123,7 @@ class Simulation:
 
     def reach(self, after_ns: int, until_ns: int) -> int:
         """
-        Return how far motion and stamps go beyond one time, at most to another.
+        Return the last time after one, up to another, that motion and stamps reach.
 
         Raises IntegrationError if they do not go on at all.
         """

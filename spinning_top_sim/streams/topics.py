@@ -81,15 +81,16 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
     imu : at the present `imu.rate`
     """
     world, body, frame = values['world_frame'], values['body_frame'], values['imu.frame_id']
+    timing = Timing(values, imu.period_ns)
 
     def channel(name: str, topic: str, type_name: str, template: Template,
                 fields: Callable[[Samples], Sequence[Values]] = lambda _: (),
-                rate: str = '', timed: bool = False) -> Channel:
+                rate_name: str = '', timed: bool = False) -> Channel:
         """Return a channel; one that is `timed` has the stamps and the losses of the IMU."""
-        return Channel(name, topic, type_name, period_ns(values[rate or f'{name}.rate']), template,
-                       fields, timing if timed and not timing.is_right else None)
+        period = period_ns(values[rate_name or f'{name}.rate'])
+        return Channel(name, topic, type_name, period, template, fields,
+                       timing if timed and not timing.is_right else None)
 
-    timing = Timing(values, imu.period_ns)
     # Covariances of angular velocity, specific force and orientation.
     noisy = [messages.diagonal(*variances) for variances in (
         3 * (imu.gyroscope.variance,), 3 * (imu.accelerometer.variance,),
