@@ -44,14 +44,24 @@ DENSITIES = {'gyroscope': 'gyroscope_noise_density',
 @dataclass(frozen=True, kw_only=True)
 class Imu:
     """
-    An IMU on a body, as far as it is known.  ValueError names a field that is not allowed.
+    An IMU on a body, as far as it is known.
 
-    lever_arm : (3,) position of the IMU in the body frame [m]; None: not known
-    mounting : (4,) q(body <- IMU) as x, y, z, w
-    field : (3,) magnetic field in the world [T]; None: not known
-    gyroscope_noise_density, accelerometer_noise_density : of white noise [rad/s/sqrt(Hz)],
-        [m/s^2/sqrt(Hz)]: a sample has the density over sqrt(interval between the samples) as its
-        standard deviation.  0: no noise; None: unknown
+    Parameters
+    ----------
+    lever_arm : (3,) float, optional
+        Position of the IMU in the body frame [m]; None: not known.
+    mounting : (4,) float
+        q(body <- IMU) as x, y, z, w.
+    field : (3,) float, optional
+        Magnetic field in the world [T]; None: not known.
+    gyroscope_noise_density, accelerometer_noise_density : float, optional
+        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
+        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+
+    Raises
+    ------
+    ValueError
+        Naming the field, its value and what is allowed.
     """
 
     lever_arm: tuple[float, float, float] | None = None

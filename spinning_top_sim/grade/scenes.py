@@ -72,9 +72,16 @@ class Scene:
     """
     A motion that is graded.
 
-    start : l3, lz, theta and theta_dot, those that are not 0
-    duration : length [s]
-    divided : divisors of dt, 1 first; several give the order of convergence
+    Parameters
+    ----------
+    name : str
+        Of the scene, in reports.
+    start : mapping
+        l3, lz, theta and theta_dot, those that are not 0.
+    duration : float
+        Length [s].
+    divided : tuple of int
+        Divisors of dt, 1 first; several give the order of convergence.
     """
 
     name: str
