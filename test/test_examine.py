@@ -238,12 +238,13 @@ def test_a_program_that_does_not_answer_as_it_should_is_told_in_a_line(
         found['found'][0]['evidence'])
 
 
-def test_the_program_in_c_is_examined(tmp_path, capsys):
+def test_the_program_in_c_of_the_page_is_examined(tmp_path, capsys):
     compiler = shutil.which('cc')
     if compiler is None:
         pytest.skip('there is no C compiler')
-    subprocess.run([compiler, '-O2', '-o', tmp_path / 'filter', ROOT / 'examples/filter.c', '-lm'],
-                   check=True)
+    text = (ROOT / 'docs/exam.md').read_text()
+    (tmp_path / 'filter.c').write_text(re.search('```c\n(.*?)```', text, re.DOTALL)[1])
+    subprocess.run([compiler, '-O2', '-o', 'filter', 'filter.c', '-lm'], cwd=tmp_path, check=True)
     assert main(['--command', str(tmp_path / 'filter'), '--seeds', '1', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     assert found['faults'] == [] and found['marks']['clean_deg']['value'] < 0.1
