@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live simulation without ROS: who gets which messages, what is counted, what it costs."""
 
+import itertools
 from collections import Counter
 
 import numpy as np
@@ -92,6 +93,15 @@ def test_a_long_integration_is_divided_and_leaves_a_state_to_read(monkeypatch):
     while behind.trajectory.steps < 4000:
         behind.send(10 ** 6 * SECOND, give_way=lambda: True)
         assert behind.state().theta[0] > 0.5
+
+
+def test_where_every_call_takes_long_time_goes_on():
+    """However little is computed at once costs the same: pieces are not halved for ever."""
+    slow = LiveSimulation(parameters.checked({}), EPOCH_NS, itertools.count(0.0, 0.02).__next__)
+    record(slow, 'pose')
+    for _ in range(300):
+        slow.send(SECOND, give_way=lambda: True)
+    assert slow.sent_ns > 20 * MILLISECOND
 
 
 def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monkeypatch):

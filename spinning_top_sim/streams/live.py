@@ -25,7 +25,7 @@ from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NEVER_NS, Times
 
 # What is computed at once: little behind an event, as the next one may come soon.
-FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
+LEAST_SPAN_NS, FIRST_SPAN_NS, LONGEST_SPAN_NS = 100_000, 20_000_000, 300_000_000
 FIRST_STRIDE_NS = 1_000     # of the motion, whose pace is not known before it is tried
 PIECE_SECONDS = 1e-2        # of computing between two calls of give_way, half of it for the solver
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
@@ -205,7 +205,7 @@ class LiveSimulation(Simulation):
             done_ns, called = goal_ns - part.computed_ns, now
             part.computed_ns, now = goal_ns, self._clock()
             # Where it took too long, the next piece is a half of it, else up to twice as long.
-            part.span_ns = (max(1, done_ns // 2) if now - called > 0.5 * seconds
+            part.span_ns = (max(LEAST_SPAN_NS, done_ns // 2) if now - called > 0.5 * seconds
                             else max(part.span_ns, 2 * done_ns))
 
     def _add(self, output: Output, log_times: Times, rows: Rows) -> None:

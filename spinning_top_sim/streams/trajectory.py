@@ -80,17 +80,23 @@ class Trajectory:
 
         Raises LookupError for times in a piece that is forgotten.
         """
-        if len(t_ns) and t_ns[0] < self._pieces[0].start_ns:
-            raise LookupError(f't = {t_ns[0]} ns: the motion before '
+        if not len(t_ns):
+            return [(self._pieces[-1], t_ns)]
+        first_ns, last_ns = int(t_ns[0]), int(t_ns[-1])
+        if first_ns < self._pieces[0].start_ns:
+            raise LookupError(f't = {first_ns} ns: the motion before '
                               f'{self._pieces[0].start_ns} ns is forgotten')
-        self._go_on(int(t_ns[-1]) if len(t_ns) else 0)
-        if len(self._pieces) == 1:
-            return [(self._pieces[0], t_ns)]
-        # A piece ends with the event that begins the next one, that instant included.
-        ends = np.searchsorted(t_ns, [piece.start_ns for piece in self._pieces[1:]], 'right')
-        found = [(piece, times) for piece, times in zip(
-            self._pieces, np.split(t_ns, ends), strict=True) if len(times)]
-        return found or [(self._pieces[-1], t_ns)]
+        self._go_on(last_ns)
+        near = self._pieces[self._number(first_ns):self._number(last_ns) + 1]
+        if len(near) == 1:
+            return [(near[0], t_ns)]
+        ends = np.searchsorted(t_ns, [piece.start_ns for piece in near[1:]], 'right')
+        return [(piece, times) for piece, times in zip(
+            near, np.split(t_ns, ends), strict=True) if len(times)]
+
+    def _number(self, t_ns: int) -> int:
+        """Return which piece a time lies in: each ends with the event that begins the next one."""
+        return max(bisect_left(self._pieces, t_ns, key=attrgetter('start_ns')) - 1, 0)
 
     def _go_on(self, t_ns: int) -> None:
         """Let pieces follow as far as a time, which lies in the last one."""
@@ -104,8 +110,7 @@ class Trajectory:
         """Return the piece in which the motion goes on after a time; the last if it does not."""
         with contextlib.suppress(IntegrationError):
             self._go_on(t_ns + 1)
-        return self._pieces[bisect_left(
-            self._pieces, t_ns + 1, key=attrgetter('start_ns')) - 1]
+        return self._pieces[self._number(t_ns + 1)]
 
     def momenta(self, t_ns: int) -> tuple[float, float]:
         """Return L3, and Lz about the vertical of the world, after a time [kg m^2/s]."""
@@ -116,7 +121,7 @@ class Trajectory:
 
     def starts(self, begin_ns: int, end_ns: int) -> list[int]:
         """Return the times in [begin, end) at which another piece begins."""
-        return [piece.start_ns for piece in self._pieces[1:]
+        return [piece.start_ns for piece in self._pieces[max(self._number(begin_ns), 1):]
                 if begin_ns <= piece.start_ns < end_ns]
 
     def increments(self, begin_ns: int, end_ns: int, point: Point) -> Increments:
@@ -187,7 +192,7 @@ class Trajectory:
 
     def forget(self, before_ns: int, steps_before_ns: int) -> None:
         """Forget the pieces before a time, and integration steps before another one."""
-        count = max(bisect_left(self._pieces, before_ns, key=attrgetter('start_ns')) - 1, 0)
+        count = self._number(before_ns)
         gone, self._pieces = self._pieces[:count], self._pieces[count:]
         self._jumps = tuple(t_ns for t_ns in self._jumps if t_ns >= self._pieces[0].start_ns)
         self._forgotten = (self._forgotten[0] + sum(piece.motion.steps for piece in gone),
