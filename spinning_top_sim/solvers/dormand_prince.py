@@ -25,7 +25,7 @@ from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.motion import Motion
-from spinning_top_sim.times import NANOSECONDS, ns_array
+from spinning_top_sim.times import NANOSECONDS, Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Unknowns = tuple[complex, ...]
@@ -48,22 +48,16 @@ SAFETY = 0.9
 SHRINK, GROW = 0.2, 5.0
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
-# A time that so many steps of the present size do not reach is refused: minutes of work.
-MOST_STEPS = 1e7
-# Steps that are taken and read together, and those that a call takes or keeps: some 50 MB.
-STEPS_TOGETHER, MOST_KEPT = 256, 50_000
+# A time that so many steps of the present size do not reach is refused: a minute of work, 1 GB.
+MOST_STEPS = 2e6
+STEPS_TOGETHER = 256            # steps that are taken and read together
 
 
 class IntegrationError(RuntimeError):
     """
     The integration cannot go on; the message says where, why and what to do instead.
 
-    Parameters
-    ----------
-    text : str
-        The message.
-    reached_ns : int
-        Last time of which there are states [ns].
+    reached_ns : the last time of which there are states [ns]
     """
 
     def __init__(self, text: str, *, reached_ns: int = 0) -> None:
@@ -196,27 +190,14 @@ class SteppedMotion(Motion):
         """Return which of the knots the step begins at that a time [s] lies in, or comes after."""
         return bisect_left(self._knots, t, 1, len(self._knots) - 1, key=attrgetter('t')) - 1
 
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+    def states(self, t: Column | Times, per_second: int = 1) -> States:
         """
-        Return the states at ascending times (n,) [ns]; missing steps are taken, and kept.
+        Return the states at ascending times (n,); missing steps are taken, and kept.
 
-        Raises IntegrationError for a time before the steps that are kept, out of reach, or more
-        than MOST_KEPT steps away; up to its `reached_ns`, the states can be had then.
+        Raises IntegrationError for a time before the steps that are kept, or out of reach; up to
+        its `reached_ns`, the states can be had then.
         """
-        t, most = ns_array(times_ns) / NANOSECONDS, self.steps + MOST_KEPT
-        while len(t) and self._knots[-1].t < t[-1]:
-            if self.steps >= most:
-                raise IntegrationError(f't = {float(t[-1])!r} s is more than {MOST_KEPT} steps '
-                                       'away: ask for times between', reached_ns=self.reached_ns)
-            self._take_steps(float(t[-1]))
-        return self.states_at_seconds(t)
-
-    def states_at_seconds(self, t: Column) -> States:
-        """
-        Return the states at ascending times t (n,) [s]; many missing steps are not all kept.
-
-        Raises IntegrationError for a time before the steps that are kept, or out of reach.
-        """
+        t = t / per_second
         if len(t) and t[0] < self._knots[0].t:
             raise IntegrationError(f't = {float(t[0])!r} s: steps go forward, and the oldest one '
                                    f'that is kept begins at {self._knots[0].t!r} s')
@@ -227,10 +208,9 @@ class SteppedMotion(Motion):
                 parts.append(self._unknowns(t[begin:end]))
                 begin = end
             else:
-                self._forget(max(len(self._knots) - MOST_KEPT, 0))
                 self._take_steps(float(t[-1]))
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
-        return self.columns(self, t.copy(), unknowns)
+        return self.columns(self, t, unknowns)
 
     def _take_steps(self, until: float) -> None:
         """Take STEPS_TOGETHER steps towards a time [s], or those that are missing."""
