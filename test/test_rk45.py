@@ -15,10 +15,10 @@ from helpers.reference import CASES, angle, quaternion_of, scene_parameters, sta
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.pivot import PivotPath
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.equations import TransportMotion
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.solve import METHODS, motion_of
-from spinning_top_sim.solvers.equations import TransportMotion
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.trajectory import Trajectory
 

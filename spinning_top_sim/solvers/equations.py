@@ -166,7 +166,7 @@ class TransportMotion(SteppedMotion):
                                  0.5 * start.phi - 0.5 * start.psi)
         # Phases of alpha and beta, less their uniform parts, and theta/2 at the begins of the
         # steps that are kept [rad].
-        self._phases_at_steps = np.array([*self._phases_at_start, half])[:, np.newaxis]
+        self._phases_at_steps = [(*self._phases_at_start, half)]
         super().__init__(
             top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
             self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
@@ -255,27 +255,27 @@ class TransportMotion(SteppedMotion):
 
     def _unwrap(self) -> None:
         """Follow the phases to the begins of all steps that are kept."""
-        new = self._knots[self._phases_at_steps.shape[1]:]
-        if new:
-            times, vectors, _ = zip(*new, strict=True)
-            t, y = np.array(times), tuple(components(vectors))
+        known = len(self._phases_at_steps)
+        if known < len(self._ends):
+            t, y = np.array(self._ends[known:]), tuple(components(self._y[known:]))
             phases = self.phases(y, self.uniform_rates[0] * t)
-            self._phases_at_steps = np.concatenate((self._phases_at_steps, [
-                phase + math.tau * np.cumsum(turns_to_follow(
-                    phase, np.concatenate(([before], phase[:-1])), sense))
+            self._phases_at_steps.extend(zip(*(
+                (phase + math.tau * np.cumsum(turns_to_follow(
+                    phase, np.concatenate(([before], phase[:-1])), sense))).tolist()
                 for phase, before, sense in zip(
-                    phases, self._phases_at_steps[:, -1], self.senses, strict=True)]), axis=1)
+                    phases, self._phases_at_steps[-1], self.senses, strict=True)), strict=True))
 
     def _forget(self, count: int) -> None:
         self._unwrap()
         super()._forget(count)
-        self._phases_at_steps = self._phases_at_steps[:, count:].copy()
+        del self._phases_at_steps[:count]
 
     def _unknowns(self, t: Column) -> UnknownRows:
         """Return the unknowns, and `_phases_at_steps` of the step that each time [s] lies in."""
         self._unwrap()
-        steps, unknowns = self._interpolated(t)
-        return np.concatenate((unknowns, self._phases_at_steps.take(steps, axis=1)))
+        first, steps, unknowns = self._interpolated(t)
+        phases = np.array(self._phases_at_steps[first:first + steps.max(initial=0) + 1])
+        return np.concatenate((unknowns, phases.T.take(steps, axis=1)))
 
 
 class _EulerStates(States):
