@@ -46,7 +46,7 @@ SAFETY = 0.9
 SHRINK, GROW = 0.2, 5.0
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
-# A time that so many steps of the present size do not reach is refused: a minute of work, 1 GB.
+# A time that so many steps of the present size do not reach is refused: half a minute, 1.2 GB.
 MOST_STEPS = 2e6
 STEPS_TOGETHER = 256            # steps that are taken and read together
 

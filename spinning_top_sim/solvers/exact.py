@@ -80,7 +80,7 @@ class ExactSolution(Motion):
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
     def states(self, t: Column | Times, per_second: int = 1) -> States:
-        """Return the states at times (n,) in any order and of any sign; 10^9 of ns in a second."""
+        """Return the states at times (n,), in any order and of any sign."""
         t = t.astype(np.float64)
         latest = float(np.abs(t).max(initial=0.0)) / per_second
         if not latest <= self.time_limit:       # catches NaN too

@@ -27,7 +27,7 @@ class Motion(ABC):
 
     @abstractmethod
     def states(self, t: Column | Times, per_second: int = 1) -> States:
-        """Return the states at ascending times (n,), of which a second has so many."""
+        """Return the states at ascending times (n,) in s, or in s/per_second."""
 
     def forget(self, before_ns: int) -> None:  # noqa: B027 - not all remember
         """Forget what only states before this time [ns] need."""
