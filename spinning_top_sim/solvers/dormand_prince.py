@@ -196,12 +196,12 @@ class SteppedMotion(Motion):
                                    f'that is kept begins at {self._ends[0]!r} s')
         parts, begin = [], 0
         while begin < len(t):
+            if self._ends[-1] < t[-1]:
+                self._take_steps(float(t[-1]))
             end = int(np.searchsorted(t, self._ends[-1], 'right'))
             if end > begin:
                 parts.append(self._unknowns(t[begin:end]))
                 begin = end
-            else:
-                self._take_steps(float(t[-1]))
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
         return self.columns(self, t, unknowns)
 
