@@ -55,7 +55,10 @@ class IntegrationError(RuntimeError):
     """
     The integration cannot go on; the message says where, why and what to do instead.
 
-    reached_ns : the last time of which there are states [ns]
+    Attributes
+    ----------
+    reached_ns : int
+        Last time of which there are states [ns].
     """
 
     def __init__(self, text: str, *, reached_ns: int = 0) -> None:

@@ -38,13 +38,21 @@ class ExactSolution(Motion):
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
     relative to the value or to its start where these are larger than 1.
 
-    gravity : in place of that of the top, for a motion about another vertical [m/s^2]
-
-    nutation_period, mean_precession_rate, mean_spin_rate, theta_min, theta_max : as in
-        `Description`, but those of a nutation however small
-    time_limit : the farthest time either way [s]: there a phase has made 2^52 turns
-
     Raises ValueError for motions whose constants doubles cannot hold, and for bad times.
+
+    Parameters
+    ----------
+    top, start : Top, State
+        The top, and its state at t = 0; of a `ContinuedState` theta may be any number.
+    gravity : mpfr, optional
+        In place of that of the top, for a motion about another vertical [m/s^2].
+
+    Attributes
+    ----------
+    nutation_period, mean_precession_rate, mean_spin_rate, theta_min, theta_max : float
+        As in `Description`, but those of a nutation however small.
+    time_limit : float
+        The farthest time either way [s]: there a phase has made 2^52 turns.
     """
 
     is_exact = True
