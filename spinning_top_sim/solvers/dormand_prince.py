@@ -55,8 +55,10 @@ class IntegrationError(RuntimeError):
     """
     The integration cannot go on; the message says where, why and what to do instead.
 
-    Attributes
+    Parameters
     ----------
+    text : str
+        The message.
     reached_ns : int
         Last time of which there are states [ns].
     """
@@ -215,11 +217,10 @@ class SteppedMotion(Motion):
             while taken < STEPS_TOGETHER and self._ends[-1] < until:
                 self._take_step()
                 taken += 1
-            newest = self._ends[-1]
-            if until - newest > MOST_STEPS * (newest - begin) / taken:
+            mean = (self._ends[-1] - begin) / taken
+            if until - self._ends[-1] > MOST_STEPS * mean:
                 raise IntegrationError(f't = {until:.9g} s is more than {MOST_STEPS:.0e} steps of '
-                                       f"{(newest - begin) / taken:.3g} s away: use method = "
-                                       "'exact'")
+                                       f"{mean:.3g} s away: use method = 'exact'")
         except IntegrationError as error:
             error.reached_ns = self.reached_ns
             raise

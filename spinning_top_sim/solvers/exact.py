@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The exact motion of the heavy symmetric top, at the same cost and accuracy for every time.
-
-`constants` finds the theta functions of a motion once, `evaluate` evaluates them in doubles.
-"""
+"""The exact motion of the heavy symmetric top, at the same cost and accuracy for every time."""
 
 from __future__ import annotations
 
