@@ -36,7 +36,7 @@ def motions(path):
         facts = solution.describe()
         t = np.linspace(0.0, nutations * facts.nutation_period, 4000)
         draw_sphere(axes, (facts.theta_min, facts.theta_max, np.pi / 2))
-        draw_tip(axes, np.column_stack(solution.states_at_seconds(t).rows_axis))
+        draw_tip(axes, np.column_stack(solution.states(t).rows_axis))
         axes.text(0.0, 1.1, caption, ha='center', color=INK, fontsize=12)
         axes.text(0.0, -0.82, f'θ from {np.degrees(facts.theta_min):.1f}° to '
                   f'{np.degrees(facts.theta_max):.1f}° every {facts.nutation_period:.2f} s',
@@ -84,7 +84,7 @@ def poles(path):
     top, l3 = scene('cusp')[0], 1.0
     lz, t = l3 + 5e-7, np.linspace(0.0, 2.0, 2001)
     start = State(theta=1.0, theta_dot=-4.0, l3=l3, lz=lz)
-    exact = ExactSolution(top, start).states_at_seconds(t)
+    exact = ExactSolution(top, start).states(t)
 
     def equations(_, y):
         theta, theta_dot, _, _ = y

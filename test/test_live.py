@@ -87,7 +87,7 @@ def test_a_long_integration_is_divided_and_leaves_a_state_to_read(monkeypatch):
         np.column_stack((there.theta, there.phi, there.psi)), abs=1e-8)
     assert taken == expected
     # The solver goes no further than samples do, and keeps the steps that they need.
-    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 2000)
+    monkeypatch.setattr(dormand_prince, 'MOST_STEPS', 2000)
     behind = simulate(pose__rate=5000.0)
     record(behind, 'pose')
     while behind.trajectory.steps < 4000:

@@ -24,7 +24,7 @@ from spinning_top_sim.physics.pivot import Kinematics, PivotPath
 from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
-from spinning_top_sim.solvers.multiprecision import precision
+from spinning_top_sim.solvers.theta import precision
 from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.trajectory import Trajectory
 

@@ -14,12 +14,11 @@ from helpers.reference import CASES, angle, quaternion_of, scene_parameters, sta
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.pivot import PivotPath
-from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.equations import TransportMotion
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.motion import Motion
 from spinning_top_sim.solvers.solve import METHODS, motion_of
-from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.trajectory import Trajectory
 
@@ -57,11 +56,11 @@ def test_a_minute_of_the_cusp_scene():
     stepped = motion_of(top, start, method='rk45', rtol=values['solver.rtol'],
                         atol=values['solver.atol'])
     period = ExactSolution(top, start).nutation_period
-    states = stepped.states_at_seconds(period * np.arange(int(seconds / period) + 1))
+    states = stepped.states(period * np.arange(int(seconds / period) + 1))
     assert np.abs(states.phi_dot).max() <= 1e-6
     for column in (states.energy / states.energy[0], states.l3 / start.l3, states.lz / start.lz):
         assert np.abs(column - 1.0).max() <= 1e-12
-    last, truth = stepped.states_at_seconds(np.array([seconds])), solve(top, start, [seconds])
+    last, truth = stepped.states(np.array([seconds])), solve(top, start, [seconds])
     assert angle(last.quaternion[0], truth.quaternion[0]) < 3e-9
     assert abs(last.phi[0] - truth.phi[0]) < 3e-9
     assert stepped.evaluations <= seconds * 1500
@@ -71,7 +70,7 @@ def test_a_minute_of_the_cusp_scene():
 def test_free_motion_and_equilibria_take_no_steps(name):
     motion = motion_of(top_of(CASES[name]), start_of(CASES[name]), method='rk45')
     state = next(s for s in CASES[name]['states'] if s['t'] == 123.4)
-    found = motion.states_at_seconds(np.array([123.4])).quaternion[0]
+    found = motion.states(np.array([123.4])).quaternion[0]
     assert motion.steps == motion.evaluations == 0
     assert angle(found, quaternion_of(state)) < 1e-12
 
@@ -109,32 +108,25 @@ def test_steps_need_no_multiprecision_and_the_exact_solution_says_what_it_needs(
         solve(TOP, sleeping, [1.0])
 
 
-def test_steps_are_read_until_they_are_forgotten(monkeypatch):
-    motion = motion_of(*LOOPING, method='rk45')
-    before = motion.states(range(0, 60 * SECOND, SECOND))
+def test_steps_are_read_until_they_are_forgotten():
+    motion, seconds = motion_of(*LOOPING, method='rk45'), np.arange(90.0)
+    before = motion.states(seconds[:60])
     steps = motion.steps
     motion.forget(30 * SECOND)
-    after = motion.states(range(30 * SECOND, 60 * SECOND, SECOND))
+    after = motion.states(seconds[30:60])
     assert after.phi.tobytes() == before.phi[30:].tobytes()
     assert motion.steps == steps and motion.reached_ns >= 59 * SECOND
     with pytest.raises(IntegrationError, match='oldest'):
-        motion.states(range(SECOND, 2 * SECOND, SECOND))
+        motion.states(seconds[1:2])
     motion.forget(100 * SECOND)                 # the newest step stays: the next begins there
-    assert len(motion.states(range(59 * SECOND, 90 * SECOND, SECOND))) == 31
-    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 50)
-    short = motion_of(*LOOPING, method='rk45')
-    assert short.states_at_seconds(np.array([59.0])).phi[0] == before.phi[59]
-    with pytest.raises(IntegrationError, match='oldest'):
-        short.states(range(1))
+    assert len(motion.states(seconds[59:])) == 31
 
 
 def test_a_solver_is_a_name_in_a_table(monkeypatch):
     """Here one that has nothing but states, and no digits beyond doubles."""
     class Another(Motion):
-        def states(self, times_ns):
-            return ExactSolution(self.top, self.start).states(times_ns)
-
-        states_at_seconds = states
+        def states(self, t, per_second=1):
+            return ExactSolution(self.top, self.start).states(t, per_second)
 
     monkeypatch.setitem(METHODS, 'another', lambda top, start, *_: Another(top, start))
     found, expected = (Trajectory(

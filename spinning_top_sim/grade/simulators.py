@@ -166,7 +166,7 @@ class Judgement:
     def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
         solution = ExactSolution(self.body, start)
-        truth = solution.states_at_seconds(told.t)
+        truth = solution.states(told.t)
         q, exact = told.rotation.as_quat(), Rotation.from_quat(truth.quaternion)
         found = conventions.best(q[:EARLY], truth.quaternion[:EARLY]) if np.max(
             (exact.inv() * told.rotation).magnitude()[:EARLY]) > WRONG else None
@@ -184,8 +184,7 @@ class Judgement:
             self.faults.append(Finding(
                 'late' if late > 0.0 else 'early', f'{name}: the attitudes are those of '
                 f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
-            exact = Rotation.from_quat(solution.states_at_seconds(
-                told.t - late * self.dt).quaternion)
+            exact = Rotation.from_quat(solution.states(told.t - late * self.dt).quaternion)
         return Motion(name, told, float(np.max((exact.inv() * told.rotation).magnitude())),
                       explained and abs(late) < LATE)
 

@@ -19,7 +19,7 @@ from spinning_top_sim.physics.top import State, Top
 
 Real = Any              # float, or a multiprecision number
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
-COINCIDE = 1e-12
+COINCIDE = 1e-10
 
 
 def natural_momentum(top: Top) -> float:
@@ -80,19 +80,14 @@ def precession_momentum(l3: Real, lz: Real, sin2_half: Real, cos2_half: Real) ->
     return (lz + l3) - 2 * l3 * cos2_half
 
 
-def regime(top: Top, state: State, theta_min: float, theta_max: float,
-           coincide: float = COINCIDE) -> str:
-    """
-    Return the name of the motion that swings between these tilts [rad].
-
-    coincide : relative distance below which cosines of tilts are equal
-    """
+def regime(top: Top, state: State, theta_min: float, theta_max: float) -> str:
+    """Return the name of the motion that swings between these tilts [rad]."""
     moves = state.l3 != 0.0 or state.lz != 0.0
     if top.gravity_torque == 0.0:
         return 'free top' if moves or state.theta_dot else 'at rest'
     low, high = math.cos(theta_max), math.cos(theta_min)
-    rests = high - low <= coincide
-    if rests and 1.0 - abs(low) <= coincide:
+    rests = high - low <= COINCIDE
+    if rests and 1.0 - abs(low) <= COINCIDE:
         if not moves:
             return 'at rest'
         if (low > 0.0) != (top.gravity_torque > 0.0):       # the centre of mass is below
@@ -100,21 +95,21 @@ def regime(top: Top, state: State, theta_min: float, theta_max: float,
         stable = state.l3 * state.l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
         return 'sleeping' if stable else 'sleeping, unstable'
     if not moves:
-        rotating = high >= 1.0 - coincide and low <= -1.0 + coincide
+        rotating = high >= 1.0 - COINCIDE and low <= -1.0 + COINCIDE
         return f'planar pendulum, {"rotating" if rotating else "swinging"}'
-    return 'steady precession' if rests else _precessing_regime(state, low, high, coincide)
+    return 'steady precession' if rests else _precessing_regime(state, low, high)
 
 
-def _precessing_regime(state: State, low: float, high: float, coincide: float) -> str:
+def _precessing_regime(state: State, low: float, high: float) -> str:
     l3, lz = state.l3, state.lz
     if l3 == 0.0:
         return 'spherical pendulum'
-    if lz == l3 and high >= 1.0 - coincide:
+    if lz == l3 and high >= 1.0 - COINCIDE:
         return 'through the top'
-    if lz == -l3 and low <= -1.0 + coincide:
+    if lz == -l3 and low <= -1.0 + COINCIDE:
         return 'through the bottom'
     reversal = lz / l3          # cos(theta) at which phi' changes sign
-    if min(abs(reversal - low), abs(reversal - high)) <= coincide * max(1.0, abs(reversal)):
+    if min(abs(reversal - low), abs(reversal - high)) <= COINCIDE * max(1.0, abs(reversal)):
         return 'cusps'
     return 'loops' if low < reversal < high else 'waves'
 

@@ -36,6 +36,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
@@ -43,15 +44,14 @@ from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers import multiprecision as mp
 from spinning_top_sim.solvers import theta
-from spinning_top_sim.solvers.theta import ThetaForm
+from spinning_top_sim.solvers.theta import BITS, ONE, ZERO, ThetaForm, atan2
 from spinning_top_sim.solvers.vertical import Posture
 
-BITS_TO_TRY = mp.BITS, 2 * mp.BITS, 4 * mp.BITS, 8 * mp.BITS
+BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
 # Smaller amplitudes leave no room for their squares in doubles.
 LEAST_AMPLITUDE = 1e-145
-with mp.precision():
+with theta.precision():
     NO_GRAVITY = mpfr('1e-1000')    # so small that u3 is infinite to all bits
 
 
@@ -64,8 +64,8 @@ class Factor(NamedTuple):
     # R and s J at even and at odd N.  If X changes its sign at a pole, R is a sine series at one
     # of them, and lacks the factor (-1)^floor(N/2).
     parts: tuple[theta.Parts, theta.Parts]
-    drift: mpfr = mp.ZERO           # kappa
-    start_argument: mpfr = mp.ZERO  # of X exp(i kappa y) at t = 0 [rad]
+    drift: mpfr = ZERO              # kappa
+    start_argument: mpfr = ZERO     # of X exp(i kappa y) at t = 0 [rad]
 
 
 class TurningPoint(NamedTuple):
@@ -75,8 +75,8 @@ class TurningPoint(NamedTuple):
     # Nearby, (Lz - L3 u)/lambda1 is precession + swing theta1(y)^2/D^2, and u' is
     # u_dot theta1(2y)/D^4 [rad/s]
     precession: mpfr
-    swing: mpfr = mp.ZERO
-    u_dot: mpfr = mp.ZERO
+    swing: mpfr = ZERO
+    u_dot: mpfr = ZERO
 
 
 class ThetaMotion(NamedTuple):
@@ -86,11 +86,11 @@ class ThetaMotion(NamedTuple):
     beta: Factor
     turning: tuple[TurningPoint, TurningPoint]
     theta1: theta.Series = theta.NOTHING
-    stretch: mpfr = mp.ZERO         # K/K' if the series are in the imaginary form, else 0
-    quarter_rate: mpfr = mp.ZERO    # quarter periods per second, w/K
+    stretch: mpfr = ZERO            # K/K' if the series are in the imaginary form, else 0
+    quarter_rate: mpfr = ZERO       # quarter periods per second, w/K
     start_whole: int = 0            # N at t = 0
-    start_offset: mpfr = mp.ZERO    # 2y/pi at t = 0, accurate relative to itself
-    m1: mpfr = mp.ONE
+    start_offset: mpfr = ZERO       # 2y/pi at t = 0, accurate relative to itself
+    m1: mpfr = ONE
     size: int = theta.MOST_TERMS    # coefficients of each polynomial that doubles need
 
     def at(self, t: mpfr) -> tuple[mpc, mpc, mpc]:
@@ -120,11 +120,6 @@ class ThetaMotion(NamedTuple):
         return alpha / sqrt(d2), beta / sqrt(d2), transverse
 
 
-def precise(top: Top, start: State | Posture) -> Posture:
-    """Return attitude and angular velocity in multiprecision."""
-    return start if isinstance(start, Posture) else Posture.of(top, start, mpfr, sin_cos)
-
-
 def set_up(top: Top, start: State | Posture, gravity: mpfr | None = None) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
@@ -136,11 +131,8 @@ def set_up(top: Top, start: State | Posture, gravity: mpfr | None = None) -> The
     algebraic, and no double but 0 has an algebraic cosine.  And if doubles cannot hold one.
     """
     for tried in BITS_TO_TRY:
-        with mp.precision(tried):
-            try:
-                return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
-            except mp.DigitsLostError:
-                continue
+        with theta.precision(tried), suppress(theta.DigitsLostError):
+            return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
     raise ValueError(f'{top} from {start}: closer to the separatrix or to steady precession than '
                      f'{BITS_TO_TRY[-1]} bits can tell')
 
@@ -166,11 +158,11 @@ class _Side(NamedTuple):
 def _set_up(top: Top, gravity: mpfr, start: State | Posture) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
-    posture = precise(top, start)
+    posture = Posture.of(top, start, mpfr, sin_cos)
     sin_half, cos_half, theta_dot, lz, alpha, beta = posture.polar(top)
     l3 = mpfr(posture.l3)
     half_spin = l3 * (1 / lambda3 - 1 / lambda1) / 2
-    arguments = [mp.atan2(z.imag, z.real) for z in (alpha, beta)]
+    arguments = [atan2(z.imag, z.real) for z in (alpha, beta)]
     sides = (
         _Side((lz + l3) / (2 * lambda1), half_spin, arguments[0], cos_half, -sin_half * theta_dot),
         _Side((lz - l3) / (2 * lambda1), -half_spin, arguments[1], sin_half, cos_half * theta_dot))
@@ -194,8 +186,8 @@ def _resting(*sides: _Side) -> ThetaMotion:
     return ThetaMotion(alpha, beta, (turning, turning))
 
 
-def _turning_point(sides: Sequence[_Side], x: Sequence[mpfr], swing: mpfr = mp.ZERO,
-                   u_dot: mpfr = mp.ZERO) -> TurningPoint:
+def _turning_point(sides: Sequence[_Side], x: Sequence[mpfr], swing: mpfr = ZERO,
+                   u_dot: mpfr = ZERO) -> TurningPoint:
     """Return the turning point with this 1 + u and 1 - u."""
     (alpha, beta), (plus, minus) = sides, x
     return TurningPoint(2.0 * math.atan2(sqrt(minus), sqrt(plus)),
@@ -205,7 +197,7 @@ def _turning_point(sides: Sequence[_Side], x: Sequence[mpfr], swing: mpfr = mp.Z
 def _nutating(sides: Sequence[_Side], cubic: tuple[mpfr, mpfr, mpfr, mpfr], mirror: int, *,
               falling: bool) -> ThetaMotion:
     """Return a motion; the cubic is its own, with M g R >= 0, or that of its mirror image (-1)."""
-    roots, f3, pair = mp.cubic_roots(*cubic), cubic[3], sides[::mirror]
+    roots, f3, pair = theta.cubic_roots(*cubic), cubic[3], sides[::mirror]
     form = ThetaForm(roots, sqrt(f3), falling=falling)
     poles = _poles(pair, roots, f3)
     alpha, beta = [_quotient(form, side, pole, is_beta) for side, pole, is_beta in zip(
@@ -220,7 +212,7 @@ def _nutating(sides: Sequence[_Side], cubic: tuple[mpfr, mpfr, mpfr, mpfr], mirr
         form.start_whole, 2 * form.y0 / const_pi(), roots.gap32 / roots.gap31, form.size)
 
 
-def _poles(pair: Sequence[_Side], roots: mp.Roots, f3: mpfr) -> tuple[theta.Place, theta.Place]:
+def _poles(pair: Sequence[_Side], roots: theta.Roots, f3: mpfr) -> tuple[theta.Place, theta.Place]:
     """
     Return the places of the pole of either number, at u = -1 and u = 1.
 
@@ -242,7 +234,7 @@ def _poles(pair: Sequence[_Side], roots: mp.Roots, f3: mpfr) -> tuple[theta.Plac
 
 def _quotient(form: ThetaForm, side: _Side, pole: theta.Place, is_beta: bool) -> Factor:
     """Return alpha or beta as a quotient of theta functions."""
-    sense, drift, to_pole = sign_of(side.pole_rate), mp.ZERO, max(abs(pole[0]), abs(pole[1]))
+    sense, drift, to_pole = sign_of(side.pole_rate), ZERO, max(abs(pole[0]), abs(pole[1]))
     rate, scale = side.half_spin, sqrt(to_pole / 2)
     if 0 < scale < LEAST_AMPLITUDE:
         raise ValueError(f'the amplitude of the motion is {float(scale):.3e}: the start is too '
@@ -250,13 +242,13 @@ def _quotient(form: ThetaForm, side: _Side, pole: theta.Place, is_beta: bool) ->
     if sense:
         amplitude = form.amplitude(is_beta, *pole)
         first, second = form.shifted(amplitude, sense)
-        drift = -sense * mp.ONE
+        drift = -sense * ONE
         if form.stretch:
-            drift += sense * 2 / const_pi() * mp.atan2(amplitude, sqrt(1 - amplitude * amplitude))
+            drift += sense * 2 / const_pi() * atan2(amplitude, sqrt(1 - amplitude * amplitude))
         rate = (side.rate(to_pole) - drift * form.y_rate
                 - second[1].leading / second[0].leading * form.x_rate)
     elif pole[2]:
-        first = form.theta1.scaled(-mp.ONE if is_beta else mp.ONE), theta.NOTHING
+        first = form.theta1.scaled(-ONE if is_beta else ONE), theta.NOTHING
         second = form.theta2, theta.NOTHING
     else:                       # proportional to dn
         first, second = (form.theta4, theta.NOTHING), (form.theta3, theta.NOTHING)
@@ -266,7 +258,7 @@ def _quotient(form: ThetaForm, side: _Side, pole: theta.Place, is_beta: bool) ->
     here, argument = (at_odd if form.start_whole % 2 else at_even), drift * form.y0
     if sense:
         real, imag = (part.at(form.start) for part in here)
-        argument += mp.atan2(imag, real)
+        argument += atan2(imag, real)
     elif pole[2]:
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.

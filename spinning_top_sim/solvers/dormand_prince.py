@@ -15,8 +15,6 @@ from abc import abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from operator import attrgetter
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +23,7 @@ from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.motion import Motion
-from spinning_top_sim.times import NANOSECONDS, ns_array
+from spinning_top_sim.times import NANOSECONDS, Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Unknowns = tuple[complex, ...]
@@ -48,10 +46,9 @@ SAFETY = 0.9
 SHRINK, GROW = 0.2, 5.0
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
-# A time that so many steps of the present size do not reach is refused: minutes of work.
-MOST_STEPS = 1e7
-# Steps that are taken and read together, and those that a call takes or keeps: some 50 MB.
-STEPS_TOGETHER, MOST_KEPT = 256, 50_000
+# A time that so many steps of the present size do not reach is refused: half a minute, 1.2 GB.
+MOST_STEPS = 2e6
+STEPS_TOGETHER = 256            # steps that are taken and read together
 
 
 class IntegrationError(RuntimeError):
@@ -104,14 +101,6 @@ def unrolled_step(size: int, is_complex: bool) -> StepFunction:
     return scope['step']
 
 
-class Knot(NamedTuple):
-    """Where a step ends and the next begins: time [s], unknowns and their derivatives."""
-
-    t: float
-    y: Unknowns
-    derivative: Unknowns
-
-
 def components(vectors: Sequence[float] | Sequence[Unknowns]) -> UnknownRows:
     """Return rows (k, n) of n vectors, or (n,) of floats; a complex component makes two rows."""
     columns: NDArray[np.generic] = np.array(vectors)
@@ -135,8 +124,9 @@ class SteppedMotion(Motion):
     def __init__(self, top: Top, start: State, y: Unknowns, tolerance: float,
                  fastest_rate: float) -> None:
         super().__init__(top, start)
+        # Where a step ends and the next begins [s], and there the unknowns and their derivatives.
         # Between these the motion can still be read; the first step has no length.
-        self._knots = 2 * [Knot(0.0, y, self.derivative(*y))]
+        self._ends, self._y, self._derivatives = 2 * [0.0], 2 * [y], 2 * [self.derivative(*y)]
         # A careful first step: the control finds the right one within a few.
         self._next_step = 0.1 * math.pow(tolerance, 0.2) / max(fastest_rate, 1e-100)
         self.steps, self.evaluations = 0, 1
@@ -155,7 +145,7 @@ class SteppedMotion(Motion):
 
     def _take_step(self) -> None:
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
-        t, y, derivative = self._knots[-1]
+        t, y, derivative = self._ends[-1], self._y[-1], self._derivatives[-1]
         grow, step = GROW, unrolled_step(len(y), isinstance(y[0], complex))
         while True:
             end = t + self._next_step
@@ -178,11 +168,13 @@ class SteppedMotion(Motion):
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.
-        self._knots.append(Knot(end, y_new, derivative_new))
+        self._ends.append(end)
+        self._y.append(y_new)
+        self._derivatives.append(derivative_new)
 
     @property
     def reached_ns(self) -> int:
-        end = self._knots[-1].t
+        end = self._ends[-1]
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
 
@@ -190,72 +182,58 @@ class SteppedMotion(Motion):
         self._forget(self._number(before_ns / NANOSECONDS))
 
     def _forget(self, count: int) -> None:
-        del self._knots[:count]
+        del self._ends[:count], self._y[:count], self._derivatives[:count]
 
     def _number(self, t: float) -> int:
-        """Return which of the knots the step begins at that a time [s] lies in, or comes after."""
-        return bisect_left(self._knots, t, 1, len(self._knots) - 1, key=attrgetter('t')) - 1
+        """Return at which of the ends the step begins that a time [s] lies in, or comes after."""
+        return bisect_left(self._ends, t, 1, len(self._ends) - 1) - 1
 
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+    def states(self, t: Column | Times, per_second: int = 1) -> States:
         """
-        Return the states at ascending times (n,) [ns]; missing steps are taken, and kept.
+        Return the states at ascending times (n,); missing steps are taken, and kept.
 
-        Raises IntegrationError for a time before the steps that are kept, out of reach, or more
-        than MOST_KEPT steps away; up to its `reached_ns`, the states can be had then.
+        Raises IntegrationError for a time before the steps that are kept, or out of reach; up to
+        its `reached_ns`, the states can be had then.
         """
-        t, most = ns_array(times_ns) / NANOSECONDS, self.steps + MOST_KEPT
-        while len(t) and self._knots[-1].t < t[-1]:
-            if self.steps >= most:
-                raise IntegrationError(f't = {float(t[-1])!r} s is more than {MOST_KEPT} steps '
-                                       'away: ask for times between', reached_ns=self.reached_ns)
-            self._take_steps(float(t[-1]))
-        return self.states_at_seconds(t)
-
-    def states_at_seconds(self, t: Column) -> States:
-        """
-        Return the states at ascending times t (n,) [s]; many missing steps are not all kept.
-
-        Raises IntegrationError for a time before the steps that are kept, or out of reach.
-        """
-        if len(t) and t[0] < self._knots[0].t:
+        t = t / per_second
+        if len(t) and t[0] < self._ends[0]:
             raise IntegrationError(f't = {float(t[0])!r} s: steps go forward, and the oldest one '
-                                   f'that is kept begins at {self._knots[0].t!r} s')
+                                   f'that is kept begins at {self._ends[0]!r} s')
         parts, begin = [], 0
         while begin < len(t):
-            end = int(np.searchsorted(t, self._knots[-1].t, 'right'))
+            if self._ends[-1] < t[-1]:
+                self._take_steps(float(t[-1]))
+            end = int(np.searchsorted(t, self._ends[-1], 'right'))
             if end > begin:
                 parts.append(self._unknowns(t[begin:end]))
                 begin = end
-            else:
-                self._forget(max(len(self._knots) - MOST_KEPT, 0))
-                self._take_steps(float(t[-1]))
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
-        return self.columns(self, t.copy(), unknowns)
+        return self.columns(self, t, unknowns)
 
     def _take_steps(self, until: float) -> None:
         """Take STEPS_TOGETHER steps towards a time [s], or those that are missing."""
         try:
-            begin, taken = self._knots[-1].t, 0
-            while taken < STEPS_TOGETHER and self._knots[-1].t < until:
+            begin, taken = self._ends[-1], 0
+            while taken < STEPS_TOGETHER and self._ends[-1] < until:
                 self._take_step()
                 taken += 1
-            newest = self._knots[-1].t
-            if until - newest > MOST_STEPS * (newest - begin) / taken:
+            mean = (self._ends[-1] - begin) / taken
+            if until - self._ends[-1] > MOST_STEPS * mean:
                 raise IntegrationError(f't = {until:.9g} s is more than {MOST_STEPS:.0e} steps of '
-                                       f"{(newest - begin) / taken:.3g} s away: use method = "
-                                       "'exact'")
+                                       f"{mean:.3g} s away: use method = 'exact'")
         except IntegrationError as error:
             error.reached_ns = self.reached_ns
             raise
 
     def _unknowns(self, t: Column) -> UnknownRows:
         """Return the unknowns (k, n) at times [s] within the steps that are kept."""
-        return self._interpolated(t)[1]
+        return self._interpolated(t)[2]
 
-    def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], UnknownRows]:
-        """Return in which of the steps that are kept times [s] lie, and the unknowns there."""
+    def _interpolated(self, t: Column) -> tuple[int, NDArray[np.int64], UnknownRows]:
+        """Return the step of the first time [s], in which step from there times lie, and y."""
         first, last = (self._number(t[0]), self._number(t[-1])) if len(t) else (0, 0)
-        ends, y, first_derivative = map(components, zip(*self._knots[first:last + 2], strict=True))
+        ends, y, first_derivative = (components(one[first:last + 2]) for one in (
+            self._ends, self._y, self._derivatives))
         h = np.diff(ends)
         start, rise = y[:, :-1], np.diff(y)
         p, q = h * first_derivative[:, :-1], h * first_derivative[:, 1:]
@@ -270,4 +248,4 @@ class SteppedMotion(Motion):
         numbers = ends[1:].searchsorted(t)
         s = (t - ends[numbers]) / np.where(h > 0.0, h, 1.0)[numbers]
         c0, c1, c2, c3, c4, c5 = coefficients.take(numbers, axis=2)
-        return first + numbers, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+        return first, numbers, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0

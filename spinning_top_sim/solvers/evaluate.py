@@ -26,8 +26,7 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import ThetaMotion
-from spinning_top_sim.solvers.multiprecision import precision
-from spinning_top_sim.solvers.theta import SIN_ODD
+from spinning_top_sim.solvers.theta import SIN_ODD, precision
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]

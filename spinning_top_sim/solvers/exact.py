@@ -1,35 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The exact motion of the heavy symmetric top, at the same cost and accuracy for every time.
-
-`constants` finds the theta functions of a motion once, `evaluate` evaluates them in doubles.
-"""
+"""The exact motion of the heavy symmetric top, at the same cost and accuracy for every time."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from gmpy2 import mpfr
-from numpy.typing import NDArray
+from gmpy2 import mpfr, sin_cos
 
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.pivot import Fractions
-from spinning_top_sim.physics.regimes import (
-    COINCIDE,
-    Description,
-    axis_rests,
-    precession_extremes,
-    regime,
-)
+from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.constants import precise, set_up
+from spinning_top_sim.solvers.constants import set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
 from spinning_top_sim.solvers.motion import Motion
-from spinning_top_sim.solvers.multiprecision import precision
+from spinning_top_sim.solvers.theta import precision
 from spinning_top_sim.solvers.vertical import Posture, Vertical
-from spinning_top_sim.times import NANOSECONDS, ns_array
+from spinning_top_sim.times import NANOSECONDS, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
@@ -45,12 +34,12 @@ class ExactSolution(Motion):
     unwrapped, the quaternion's sign is continuous.  On every motion each of them is within 5e-15,
     relative to the value or to its start where these are larger than 1.
 
+    Raises ValueError for motions whose constants doubles cannot hold, and for bad times.
+
     Parameters
     ----------
-    top : Top
-        The top to simulate.
-    start : State
-        The state at t = 0; of a `ContinuedState` theta may be any number.
+    top, start : Top, State
+        The top, and its state at t = 0; of a `ContinuedState` theta may be any number.
     gravity : mpfr, optional
         In place of that of the top, for a motion about another vertical [m/s^2].
 
@@ -60,11 +49,6 @@ class ExactSolution(Motion):
         As in `Description`, but those of a nutation however small.
     time_limit : float
         The farthest time either way [s]: there a phase has made 2^52 turns.
-
-    Raises
-    ------
-    ValueError
-        For motions whose constants doubles cannot hold, and from every evaluation for bad times.
     """
 
     is_exact = True
@@ -85,37 +69,23 @@ class ExactSolution(Motion):
             self.arrays = ThetaArrays(motion, self.start)
         self.theta_min, self.theta_max = sorted(one.tilt for one in motion.turning)
 
-    def describe(self, coincide: float = COINCIDE) -> Description:
-        """
-        Return the motion in numbers.
-
-        Parameters
-        ----------
-        coincide : float
-            Relative distance below which two turning points are one.
-        """
+    def describe(self) -> Description:
         top, start = self.top, self.start
         low, rests = self.theta_min, axis_rests(top, start)
         high = low if rests else self.theta_max
         slowest, fastest = precession_extremes(top, start, low, high)
         weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
         return Description(
-            name=regime(top, start, low, high, coincide),
+            name=regime(top, start, low, high),
             nutation_period=None if rests else self.nutation_period,
             theta_min=low, theta_max=high, mean_precession_rate=self.mean_precession_rate,
             precession_min=slowest, precession_max=fastest, mean_spin_rate=self.mean_spin_rate,
             separatrix_distance=float(self._motion.m1),
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at nanoseconds (n,), in any order and of any sign."""
-        return self._states_at(NANOSECONDS, ns_array(times_ns).astype(np.float64))
-
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at t (n,) [s], in any order and of any sign."""
-        return self._states_at(1, t)
-
-    def _states_at(self, per_second: int, t: Column) -> States:
+    def states(self, t: Column | Times, per_second: int = 1) -> States:
+        """Return the states at times (n,), in any order and of any sign."""
+        t = t.astype(np.float64)
         latest = float(np.abs(t).max(initial=0.0)) / per_second
         if not latest <= self.time_limit:       # catches NaN too
             raise ValueError(
@@ -132,7 +102,7 @@ class ExactSolution(Motion):
         They are right to 38 digits, times what the motion makes of such an error.
         """
         with precision():
-            found = precise(self.top, self._given)
+            found = Posture.of(self.top, self._given, mpfr, sin_cos)
             if t_ns:                # perhaps at a pole, where the axis does not tell its rates
                 found = Posture(*self._motion.at(mpfr(t_ns) / NANOSECONDS), found.l3)
             return vertical.to_world(found) if vertical else found
@@ -143,5 +113,5 @@ def exact_about(top: Top, start: State | Posture,
     """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
     with precision():
         vertical = Vertical.of(top, acceleration, mpfr)
-        posture = vertical.to_frame(precise(top, start))
+        posture = vertical.to_frame(Posture.of(top, start, mpfr, sin_cos))
     return ExactSolution(vertical.top, posture, vertical.gravity), vertical

@@ -53,8 +53,7 @@ class Piece:
         self.rests = ride is pivot.REST and isinstance(start, State)
         try:
             with np.errstate(over='ignore', invalid='ignore'):
-                posture = (Posture.of(top, start) if isinstance(start, State)
-                           else start.in_doubles())
+                posture = Posture.of(top, start).in_doubles()
                 self.motion, self._vertical = self._solution(posture, method, settings)
                 top, begin = self.motion.top, self.motion.start     # in effective gravity
                 self.l3, self.lz, transverse = begin.l3, begin.lz, abs(posture.transverse)
@@ -91,7 +90,7 @@ class Piece:
         """
         times_ns = ns_array(t_ns)
         try:
-            states = self.motion.states(times_ns - self.start_ns)
+            states = self.motion.states(times_ns - self.start_ns, NANOSECONDS)
         except IntegrationError as error:
             error.reached_ns += self.start_ns
             raise

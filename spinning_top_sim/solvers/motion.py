@@ -26,12 +26,8 @@ class Motion(ABC):
         self.top, self.start = top, start
 
     @abstractmethod
-    def states(self, times_ns: Times | range) -> States:
-        """Return the states at ascending times (n,) [ns]."""
-
-    @abstractmethod
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at ascending times (n,) [s]."""
+    def states(self, t: Column | Times, per_second: int = 1) -> States:
+        """Return the states at ascending times (n,) in s, or in s/per_second."""
 
     def forget(self, before_ns: int) -> None:  # noqa: B027 - not all remember
         """Forget what only states before this time [ns] need."""

@@ -15,9 +15,8 @@ from spinning_top_sim.installation import needed
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
-from spinning_top_sim.solvers.euler import EulerMotion
+from spinning_top_sim.solvers.equations import EulerMotion, TransportMotion
 from spinning_top_sim.solvers.motion import Motion
-from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.solvers.vertical import Posture
 
 # Doubles do not hold the squares of larger rates [rad/s]; those of the spin are smaller anyway.
@@ -59,7 +58,7 @@ def motion_of(top: Top, start: State | Posture, *, method: str, equations: str =
         if not (isinstance(value, int | float) and least <= value <= 1e-2):
             raise ValueError(f'{name} = {shown(value)}: must be in [{least:g}, 1e-2]')
     try:
-        now = Posture.of(top, start) if isinstance(start, State) else start
+        now = Posture.of(top, start)
         if not abs(now.transverse) <= FASTEST_AXIS:
             raise OverflowError
     except ArithmeticError:
@@ -113,7 +112,7 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
         Naming the argument, its value and what is allowed.
     IntegrationError
         Where the 'euler' equations cannot go on, a step collapses, or the last time is more than
-        1e7 steps of the present size away.
+        2e6 steps of the present size away.
 
     Examples
     --------
@@ -141,4 +140,4 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
             raise ValueError(f't[{at}] = {times[at]} s after {before[at]} s: must not decrease '
                              f'with method = {method!r}')
     motion = motion_of(top, start, method=method, equations=equations, rtol=rtol, atol=atol)
-    return motion.states_at_seconds(times)
+    return motion.states(times)

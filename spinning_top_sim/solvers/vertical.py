@@ -50,10 +50,12 @@ class Posture(NamedTuple):
     lz: Real | None = None
 
     @classmethod
-    def of(cls, top: Top, state: State, real: Callable[[Any], Real] = float,
+    def of(cls, top: Top, state: State | Posture, real: Callable[[Any], Real] = float,
            sin_cos: Callable[[Real], tuple[Real, Real]] = lambda x: (math.sin(x), math.cos(x)),
            ) -> Posture:
         """Return that of a state, which may be continued, in numbers with this sine and cosine."""
+        if isinstance(state, Posture):
+            return state
         half, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
         (sine, cosine), *others = map(sin_cos, (half, phi + psi, phi - psi))
         alpha, beta = (z / abs(z) for z in (cos + 1j * sin for sin, cos in others))

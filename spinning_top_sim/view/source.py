@@ -29,7 +29,7 @@ Reals = NDArray[np.float64]
 WINDOW_NS = 10 * NANOSECONDS    # of traces and plots; twice this is kept
 POINTS, FEWEST, PER_TURN = 2000, 500, 20    # in a span: most and least; in the fastest turn
 NUTATIONS = 4               # that a span has room for, however fast phi turns near a pole
-SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
+SNAP = 1e-9                 # relative distance within which a constant is taken for a special one
 SAME = 1e-6                 # relative difference between the constants of one motion
 
 
@@ -63,7 +63,7 @@ class Motion:
         with contextlib.suppress(ArithmeticError, ValueError):
             if not pivot_moves:
                 description = ExactSolution(top, State(
-                    theta=state.theta, theta_dot=theta_dot, l3=l3, lz=lz)).describe(SNAP)
+                    theta=state.theta, theta_dot=theta_dot, l3=l3, lz=lz)).describe()
         height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
         return cls(state.l3, state.lz, 0.5 * top.lambda1 * state.theta_dot ** 2
                    + float(height[0]), description, pivot_moves)

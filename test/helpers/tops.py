@@ -66,8 +66,8 @@ def check_motion(top, start):
     period = solution.nutation_period or 1.0 / (
         abs(solution.mean_precession_rate) + abs(solution.mean_spin_rate) or 1.0)
     times = period * np.concatenate((INSTANTS, FAR))
-    motion = solution.states_at_seconds(period * INSTANTS)
-    check_constants(solution.states_at_seconds(times[abs(times) < solution.time_limit]))
+    motion = solution.states(period * INSTANTS)
+    check_constants(solution.states(times[abs(times) < solution.time_limit]))
     for name in ('theta', 'phi', 'psi', 'theta_dot'):
         wanted = getattr(start, name)
         assert abs(getattr(motion, name)[0] - wanted) <= EXACT * max(1.0, abs(wanted)), name
@@ -75,7 +75,7 @@ def check_motion(top, start):
     # The error of a step is told by an estimate, and magnified where the nutation turns back: the
     # sum of all is within twenty times their count times the tolerance.
     steps = motion_of(top, start, method='rk45', rtol=RTOL, atol=0.1 * RTOL)
-    stepped = steps.states_at_seconds(period * INSTANTS)
+    stepped = steps.states(period * INSTANTS)
     assert all(np.all(np.isfinite(getattr(stepped, name))) for name in COLUMNS)
     # Near a separatrix neighbouring motions part.
     if solution.describe().separatrix_distance > 1e-3:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The regular equations of motion, stepped by rk45, and their states."""
+"""Two forms of the equations of motion that rk45 steps, and their states."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,6 +13,7 @@ from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import (
+    IntegrationError,
     SteppedMotion,
     UnknownRows,
     Unknowns,
@@ -25,6 +26,11 @@ from spinning_top_sim.solvers.vertical import Posture
 NUTATION_SHARE = 1e-6
 # (sin(theta)/2)^2 below which rounding in L.e3 would spoil the momentum more than it mends it.
 POLE_SHARE = 1e-4
+# lambda3/lambda1 at which the rounding of psi' + phi' cos(theta) costs eq. (29) a millionth.
+LARGEST_RATIO = 1e-6 * 2.0 ** 53
+# |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
+SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
+ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
 # Real and imaginary parts of alpha, beta and m.
 Components = Sequence[Column]
 # What a projection computes with: sqrt, copysign and where.
@@ -107,27 +113,21 @@ class _TransportStates(States):
 
 class TransportMotion(SteppedMotion):
     """
-    Regular at every attitude; docs/theta_functions.md derives these equations.
+    Equations of alpha, beta and m = i (L_x + i L_y)/(2 lambda1), regular at every attitude.
 
-        alpha' =  i (Lz - c)/(2 lambda1) alpha + m conj(beta)
-        beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
-        m'     = -(P/lambda1) alpha beta,       m = i (L_x + i L_y)/(2 lambda1)
-
-    They are those of a frame that turns with the body less chi = L3/lambda3 - (L3 - c)/lambda1:
-    the factor exp(+-i chi t/2) is put on when a state is read, and steps need not follow the spin.
+    docs/theta_functions.md derives them, and the rates of phi + psi and phi - psi.  They are those
+    of a frame that turns with the body less chi = L3/lambda3 - (L3 - c)/lambda1: the factor
+    exp(+-i chi t/2) is put on when a state is read, and steps need not follow the spin.
 
     The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
     sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
 
-    phi + psi and phi - psi are twice the phases of alpha and beta, with the rates
-
-        alpha:   Omega/2 + (Lz + L3)/(4 lambda1 cos^2(theta/2)),   Omega = L3/lambda3 - L3/lambda1,
-        beta:   -Omega/2 + (Lz - L3)/(4 lambda1 sin^2(theta/2)).
-
-    The second term never changes its sign, and turns the phase by little more than half a turn in
-    a step, however near a pole.  So the phase of a sample is, of all arctan2(..) + 2 pi k, the
-    first one ahead of that at the begin of its step.  Without a second term the number moves on a
-    line through zero, and its modulus changes sign where the axis passes that pole.
+    phi + psi and phi - psi are twice the phases of alpha and beta, whose rates are +-Omega/2 and a
+    term with Lz + L3 or Lz - L3.  This term never changes its sign, and turns the phase by little
+    more than half a turn in a step, however near a pole.  So the phase of a sample is, of all
+    arctan2(..) + 2 pi k, the first one ahead of that at the begin of its step.  Without this term
+    the number moves on a line through zero, and its modulus changes sign where the axis passes
+    that pole.
 
     posture : of `start`, in doubles that know more of it
     """
@@ -166,7 +166,7 @@ class TransportMotion(SteppedMotion):
                                  0.5 * start.phi - 0.5 * start.psi)
         # Phases of alpha and beta, less their uniform parts, and theta/2 at the begins of the
         # steps that are kept [rad].
-        self._phases_at_steps = np.array([*self._phases_at_start, half])[:, np.newaxis]
+        self._phases_at_steps = [(*self._phases_at_start, half)]
         super().__init__(
             top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
             self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
@@ -255,24 +255,110 @@ class TransportMotion(SteppedMotion):
 
     def _unwrap(self) -> None:
         """Follow the phases to the begins of all steps that are kept."""
-        new = self._knots[self._phases_at_steps.shape[1]:]
-        if new:
-            times, vectors, _ = zip(*new, strict=True)
-            t, y = np.array(times), tuple(components(vectors))
+        known = len(self._phases_at_steps)
+        if known < len(self._ends):
+            t, y = np.array(self._ends[known:]), tuple(components(self._y[known:]))
             phases = self.phases(y, self.uniform_rates[0] * t)
-            self._phases_at_steps = np.concatenate((self._phases_at_steps, [
-                phase + math.tau * np.cumsum(turns_to_follow(
-                    phase, np.concatenate(([before], phase[:-1])), sense))
+            self._phases_at_steps.extend(zip(*(
+                (phase + math.tau * np.cumsum(turns_to_follow(
+                    phase, np.concatenate(([before], phase[:-1])), sense))).tolist()
                 for phase, before, sense in zip(
-                    phases, self._phases_at_steps[:, -1], self.senses, strict=True)]), axis=1)
+                    phases, self._phases_at_steps[-1], self.senses, strict=True)), strict=True))
 
     def _forget(self, count: int) -> None:
         self._unwrap()
         super()._forget(count)
-        self._phases_at_steps = self._phases_at_steps[:, count:].copy()
+        del self._phases_at_steps[:count]
 
     def _unknowns(self, t: Column) -> UnknownRows:
         """Return the unknowns, and `_phases_at_steps` of the step that each time [s] lies in."""
         self._unwrap()
-        steps, unknowns = self._interpolated(t)
-        return np.concatenate((unknowns, self._phases_at_steps.take(steps, axis=1)))
+        first, steps, unknowns = self._interpolated(t)
+        phases = np.array(self._phases_at_steps[first:first + steps.max(initial=0) + 1])
+        return np.concatenate((unknowns, phases.T.take(steps, axis=1)))
+
+
+class _EulerStates(States):
+    method = 'rk45'
+
+    def __init__(self, motion: SteppedMotion, t: Column, unknowns: UnknownRows) -> None:
+        super().__init__(motion.top, motion.start, len(t))
+        theta, theta_dot, phi, psi = unknowns
+        self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        return attitude.quaternion_of_angles(*self.angles)
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        return attitude.transverse(self.theta_dot, self.phi_dot * np.sin(self.theta),
+                                   np.cos(self.psi), np.sin(self.psi))
+
+
+class EulerMotion(SteppedMotion):
+    """
+    Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
+
+    They are singular where the axis is vertical, and near there wrong without a sign of it: see
+    docs/theta_functions.md.  So they stop with an error there, and do not begin with a disc whose
+    lambda3/lambda1 loses digits.
+    """
+
+    columns = _EulerStates
+
+    def __init__(self, top: Top, start: State, _: Posture, rtol: float, atol: float) -> None:
+        if top.lambda3 > LARGEST_RATIO * top.lambda1:
+            raise ValueError(
+                f'lambda3 = {top.lambda3!r} kg m^2: must be at most {LARGEST_RATIO:.2g} lambda1 '
+                f"for the euler equations: eq. (29) loses psi' + phi' cos(theta); {ADVICE}")
+        self.top, self._l3, self._lz = top, start.l3, start.lz
+        self._rtol, self._atol = rtol, atol
+        super().__init__(
+            top, start, (start.theta, start.theta_dot, start.phi, start.psi), rtol + atol,
+            abs(start.theta_dot) + (abs(start.l3) + abs(start.lz)) / top.lambda1
+            + abs(start.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
+
+    def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Unknowns:
+        """Return (theta', theta'', phi', psi'), eqs. (29)-(32); IntegrationError near a pole."""
+        sine, cosine = math.sin(theta), math.cos(theta)
+        if not abs(sine) > SMALLEST_SINE:
+            raise IntegrationError(
+                f'euler equations: the axis is at a pole (theta = {theta!r} rad): cos(theta) '
+                f"rounds to {cosine!r} and eq. (31) loses phi'; {ADVICE}")
+        top = self.top
+        phi_dot = (self._lz - self._l3 * cosine) / (top.lambda1 * sine * sine)
+        psi_dot = self._l3 / top.lambda3 - phi_dot * cosine
+        return (theta_dot,
+                phi_dot * phi_dot * sine * cosine
+                - top.lambda3 / top.lambda1 * (psi_dot + phi_dot * cosine) * phi_dot * sine
+                + top.gravity_torque / top.lambda1 * sine,
+                phi_dot, psi_dot)
+
+    def second_derivative(self, y: UnknownRows, derivative: UnknownRows) -> UnknownRows:
+        theta = y[0]
+        theta_dot, theta_ddot, phi_dot, _ = derivative
+        sine, cosine = np.sin(theta), np.cos(theta)
+        lambda1 = self.top.lambda1
+        phi_ddot = theta_dot * (self._l3 / lambda1 - 2.0 * phi_dot * cosine) / sine
+        theta_dddot = (
+            2.0 * phi_dot * phi_ddot * sine * cosine
+            + theta_dot * phi_dot * phi_dot * (cosine * cosine - sine * sine)
+            - self._l3 / lambda1 * (phi_ddot * sine + phi_dot * cosine * theta_dot)
+            + self.top.gravity_torque / lambda1 * cosine * theta_dot)
+        return np.array((theta_ddot, theta_dddot, phi_ddot,
+                         phi_dot * sine * theta_dot - phi_ddot * cosine))
+
+    def errors(self, y: Unknowns, y_new: Unknowns, difference: Unknowns) -> tuple[float, ...]:
+        return tuple(
+            abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
+            for e, a, b in zip(difference, y, y_new, strict=True))
+
+    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
+        """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
+        before, after = y[0].real, y_new[0].real
+        if math.floor(before / math.pi) != math.floor(after / math.pi):
+            raise IntegrationError(
+                f'euler equations: a step leapt over a pole, from theta = {before!r} to '
+                f'{after!r} rad, and lost phi and psi; {ADVICE}')
+        return y_new
