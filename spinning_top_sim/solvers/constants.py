@@ -72,9 +72,9 @@ class TurningPoint(NamedTuple):
     """The turning point at even N, where u = u1, or at odd N, where u = u2."""
 
     tilt: float                     # theta in [0, pi] [rad]
-    # Nearby, (Lz - L3 u)/lambda1 is precession + swing theta1(y)^2/D^2, and u' is
+    # Nearby, (Lz - L3 u)/lambda1 is momentum_rate + swing theta1(y)^2/D^2, and u' is
     # u_dot theta1(2y)/D^4 [rad/s]
-    precession: mpfr
+    momentum_rate: mpfr
     swing: mpfr = ZERO
     u_dot: mpfr = ZERO
 
@@ -197,12 +197,12 @@ def _turning_point(sides: Sequence[_Side], x: Sequence[mpfr], swing: mpfr = ZERO
 def _nutating(sides: Sequence[_Side], cubic: tuple[mpfr, mpfr, mpfr, mpfr], mirror: int, *,
               falling: bool) -> ThetaMotion:
     """Return a motion; the cubic is its own, with M g R >= 0, or that of its mirror image (-1)."""
-    roots, f3, pair = theta.cubic_roots(*cubic), cubic[3], sides[::mirror]
+    roots, f3, mirrored = theta.cubic_roots(*cubic), cubic[3], sides[::mirror]
     form = ThetaForm(roots, sqrt(f3), falling=falling)
-    poles = _poles(pair, roots, f3)
+    poles = _poles(mirrored, roots, f3)
     alpha, beta = [_quotient(form, side, pole, is_beta) for side, pole, is_beta in zip(
-        pair, poles, (False, True), strict=True)][::mirror]
-    turn = pair[1].pole_rate - pair[0].pole_rate        # -L3/lambda1
+        mirrored, poles, (False, True), strict=True)][::mirror]
+    turn = mirrored[1].pole_rate - mirrored[0].pole_rate        # -L3/lambda1
     even, odd = (
         _turning_point(sides, [abs(pole[k]) for pole in poles][::mirror], turn * rise,
                        rise * middle ** 2 * form.slope1 * mirror * form.x_rate)

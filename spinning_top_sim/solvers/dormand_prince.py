@@ -31,7 +31,7 @@ Unknowns = tuple[complex, ...]
 UnknownRows = NDArray[np.float64]
 
 
-# The last row are the weights of fifth order, which are the last stage, less those of fourth.
+# ERROR has the weights of fifth order, those of the last stage, less those of fourth.
 *STAGES, ERROR = (tuple(map(Fraction, row.split())) for row in (
     '1/5',
     '3/40 9/40',
@@ -140,7 +140,7 @@ class SteppedMotion(Motion):
         """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
 
     @abstractmethod
-    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
+    def corrected(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
 
     def _take_step(self) -> None:
@@ -163,7 +163,7 @@ class SteppedMotion(Motion):
                 break
             grow = 1.0
             self._next_step = h * factor
-        y_new = self.accepted(y, y_new)
+        y_new = self.corrected(y, y_new)
         self._next_step = h * min(grow, factor)
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the

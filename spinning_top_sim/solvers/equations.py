@@ -44,7 +44,8 @@ def turns_to_follow(phase: Column, before: Column, sense: float) -> Column:
     """
     Return the whole turns to add to `phase` so that it follows `before` [rad].
 
-    In this sense, but for rounding; without one (0) it is the nearest.
+    sense : 1: it becomes the least that is not behind, -1: the largest that is not ahead, but for
+        rounding; 0: the nearest
     """
     return 0.0 - np.rint((phase - before - 0.5 * math.pi * sense) / math.tau)
 
@@ -168,7 +169,7 @@ class TransportMotion(SteppedMotion):
         # steps that are kept [rad].
         self._phases_at_steps = [(*self._phases_at_start, half)]
         super().__init__(
-            top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
+            top, start, self.corrected((), (alpha, beta, m)), self._tolerance,
             self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
 
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Unknowns:
@@ -194,7 +195,7 @@ class TransportMotion(SteppedMotion):
         tolerance = self._tolerance
         return abs(da) / tolerance, abs(db) / tolerance, abs(dm) / self._scale / tolerance
 
-    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
+    def corrected(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return y_new moved back onto the invariants; see `project`."""
         alpha, beta, m = y_new
         projected = self.project(
@@ -354,7 +355,7 @@ class EulerMotion(SteppedMotion):
             abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
             for e, a, b in zip(difference, y, y_new, strict=True))
 
-    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
+    def corrected(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
         before, after = y[0].real, y_new[0].real
         if math.floor(before / math.pi) != math.floor(after / math.pi):

@@ -138,7 +138,7 @@ class ThetaArrays:
         self.sense = math.copysign(1.0, start.theta_dot) * self.sign * (len(self.zeros) == 2)
         self.start_half = 0.5 * abs(start.theta - self.turn)
         # At even and at odd N
-        _, self.precession, self.swing, u_dot = np.array(
+        _, self.momentum_rates, self.swing, u_dot = np.array(
             [[*map(float, one)] for one in motion.turning]).T
         self.fall = -self.sign * u_dot
         self.theta1 = _highest_first([motion.theta1.polynomial(motion.size)])
@@ -162,7 +162,8 @@ class ExactStates(States):
         self._turned, self._turned_rest, whole, part = arrays.phases.at(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
-        # Cosine and sine by the tangent of half the angle, which is at most 1.
+        # Cosine and sine by the tangent of half the angle, which is at most 1.  From here on `part`
+        # is the memory of the tangents, and then of the sines.
         part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
         square = tangent * tangent
@@ -270,7 +271,7 @@ class ExactStates(States):
                 across += of_beta * (alpha / beta)
             return across
         series = self._sin_y * _horner(arrays.theta1, self._xi)
-        momentum = (arrays.precession.take(self._parity) * (alpha * alpha + beta * beta)
+        momentum = (arrays.momentum_rates.take(self._parity) * (alpha * alpha + beta * beta)
                     + arrays.swing.take(self._parity) * (series * series))
         slow: Column = 0.5 * momentum / (alpha * beta)
         return slow

@@ -40,7 +40,7 @@ class Piece:
     method, settings : as of `motion_of`
 
     motion : the solution, in the frame of the pivot about the line of effective gravity
-    rests : whether the pivot has always rested
+    rests : whether the pivot has always rested; behind a ride a motion begins with a Posture
     l3, lz, energy : constants of the motion; Lz about that line, which is positive upwards
     fastest_rate : bound on how fast the attitude and the body's rates change [rad/s]
 

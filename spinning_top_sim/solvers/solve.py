@@ -21,7 +21,7 @@ from spinning_top_sim.solvers.vertical import Posture
 
 # Doubles do not hold the squares of larger rates [rad/s]; those of the spin are smaller anyway.
 FASTEST_AXIS = 1e100
-# They make a motion of the top, the start, its posture, rtol and atol.
+# Called with the top, the start, its posture, rtol and atol.
 EQUATIONS: Mapping[str, Callable[..., Motion]] = {
     'transport': TransportMotion, 'euler': EulerMotion}
 
@@ -32,7 +32,7 @@ def _closed_form(top: Top, start: State, *_: Any) -> Motion:
     return ExactSolution(top, start)
 
 
-# They make a motion of the top, the start, the name of equations, and what these take.
+# Called with the top, the start, the name of equations, and what EQUATIONS take besides these.
 METHODS: Mapping[str, Callable[..., Motion]] = {
     'rk45': lambda top, start, equations, *others: EQUATIONS[equations](top, start, *others),
     'exact': _closed_form}

@@ -39,7 +39,7 @@ class Posture(NamedTuple):
     alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
     transverse : omega_1 + i omega_2 in the body [rad/s]
     l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
-    theta_dot, lz : of a `State` about the same vertical, which the others tell to fewer digits
+    theta_dot, lz : of a `State` about the same vertical, which the others tell less exactly
     """
 
     alpha: Complex
@@ -96,10 +96,10 @@ class Posture(NamedTuple):
         if not tilt or (lz is None and tilt < pole):
             rate = abs(transverse) if theta_dot is None else theta_dot
             turn = -1j * transverse / rate if rate else 1 + 0j      # exp(-i psi)
-            none = 0 * sine
+            zero = 0 * sine
             if sine < cosine:
-                return none, 1 + none, rate, l3, alpha, alpha * turn
-            return 1 + none, none, rate, -l3, beta * turn.conjugate(), beta
+                return zero, 1 + zero, rate, l3, alpha, alpha * turn
+            return 1 + zero, zero, rate, -l3, beta * turn.conjugate(), beta
         if theta_dot is None or lz is None:
             # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
             # + i theta') exp(-i psi)
