@@ -162,8 +162,8 @@ class ExactStates(States):
         self._turned, self._turned_rest, whole, part = arrays.phases.at(per_second, t)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
-        # Cosine and sine by the tangent of half the angle, which is at most 1.  From here on `part`
-        # is the memory of the tangents, and then of the sines.
+        # Cosine and sine by the tangent of half the angle, which is at most 1.  `part` is
+        # the memory of the tangents, then of the sines.
         part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
         square = tangent * tangent
