@@ -5,7 +5,7 @@
 from pathlib import Path
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools.urdf import robot_description
+from spinning_top_sim.tools.export import robot_description
 
 HEAD = """<?xml version="1.0"?>
 <!-- SPDX-License-Identifier: Apache-2.0 -->

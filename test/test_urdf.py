@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Mounting
 from spinning_top_sim.streams.topics import JOINTS
-from spinning_top_sim.tools import urdf
+from spinning_top_sim.tools import export
 from spinning_top_sim.tools.export import model
 
 pytest.importorskip('xacro')
@@ -20,7 +20,7 @@ MOUNTED = {'imu.lever_arm': (0.1, -0.05, 0.3), 'imu.rpy': (0.3, -0.2, 1.1)}
 
 
 def described(values):
-    return urdf.robot_description(parameters.checked(values), ROOT / 'urdf')
+    return export.robot_description(parameters.checked(values), ROOT / 'urdf')
 
 
 def matrix(q):

@@ -9,7 +9,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from spinning_top_sim.streams.topics import resolve_topic
-from spinning_top_sim.tools.urdf import robot_description
+from spinning_top_sim.tools.export import robot_description
 
 
 def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, joint_states: str,

@@ -24,9 +24,14 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.shape import Shape
 from spinning_top_sim.solvers.solve import solve
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import cli, scene_file, urdf
+from spinning_top_sim.tools import cli, scene_file
 
 FORMATS = ('mjcf', 'urdf', 'sdf')
+FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')
+# Arguments of the xacro file and the parameters that they are taken from.
+ARGUMENTS = {name.removeprefix('top.').replace('.', '_'): name for name in (
+    'top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'imu.lever_arm', 'imu.rpy',
+    *FRAMES)}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,11 +80,28 @@ def model(values: Mapping[str, Any], file_format: str) -> str:
         ('body', 'body_frame'), ('imu', 'imu.frame_id'))}
     if file_format == 'urdf':
         with needed('a URDF file', 'xacro'):
-            text = urdf.robot_description(values, share() / 'urdf')
+            text = robot_description(values, share() / 'urdf')
         words['robot'] = text.partition('\n')[2].strip()
     templates = read_table('tools/models.toml')
     words['facts'] = Template(templates['facts']).substitute(words)
     return Template(templates[file_format]).substitute(words)
+
+
+def robot_description(values: Mapping[str, Any], folder: Path) -> str:
+    """Return the URDF from the xacro file in a folder; ValueError if the frames form no tree."""
+    import xacro  # noqa: PLC0415
+
+    body = values['body_frame']
+    prefix = body[:body.rfind('/') + 1]         # a/base_link, a/nutation_link
+    between = [f'{prefix}precession_link', f'{prefix}nutation_link']
+    for name in FRAMES:         # that these differ from each other is checked before
+        if values[name] in between:
+            raise ValueError(f'{name} = {values[name]!r}: must not be one of {", ".join(between)}')
+    given = {'prefix': prefix, **{name: values[key] for name, key in ARGUMENTS.items()}}
+    document = xacro.process_file(str(folder / 'spinning_top.urdf.xacro'), mappings={
+        name: ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
+        for name, value in given.items()})
+    return '<?xml version="1.0"?>\n' + document.documentElement.toprettyxml(indent='  ')
 
 
 main = partial(cli.run, 'export', __doc__, add_arguments, _run)
