@@ -84,14 +84,14 @@ class Comparison:
                  widths: Sequence[int] = kinematics.WIDTHS) -> None:
         self.kind, self.gravity, self.units = kind, gravity, KINDS[kind]
         self.arm, self.field = (np.array(one or np.zeros(3)) for one in (imu.lever_arm, imu.field))
-        # Effects of unknown size, even in a right reading.
         known = {'accelerations': imu.lever_arm, 'magnetometer': imu.field}.get(kind, ())
         self.always = [f'{"field" if kind == "magnetometer" else "arm"} {k}'
                        for k in range(3)] if known is None else []
         self.mounting = Rotation.from_quat((0, 0, 0, 1) if kind == 'rates' else imu.mounting)
         stretches = [one for one in stretches if kind in one.readings]
         sizes = [rms(one.readings[kind]) for one in stretches]
-        self.sizes = np.maximum(sizes, 0.01 * max(sizes, default=0.0) or 1.0)   # one may rest
+        least = 0.1 if kind in OF_TURNS else 0.01       # at rest there are no rates, but gravity
+        self.sizes = np.maximum(sizes, least * max(sizes, default=0.0) or 1.0)
         self.reading_noise = rms(np.array([one.sigma.get(kind, 0.0) for one in stretches] or [0]))
         # The interval of the sensor [s], and its samples per sample that is compared.
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
