@@ -24,4 +24,4 @@ def test_every_row_of_the_page_has_its_adapter_and_a_fine_tolerance_passes(monke
     scipy = importlib.import_module('engines.integrators').scipy
     for tolerances, passes in (({'rtol': 1e-10, 'atol': 1e-12}, True), ({}, False)):
         assert grade(lambda *given, **_: scipy(*given, 'DOP853', **tolerances),  # noqa: B023
-                     scenes=[replace(SCENES[0], duration=3.0, divided=(1, 2))]).passed == passes
+                     scenes=[replace(SCENES[0], duration=3.0)]).passed == passes

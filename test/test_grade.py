@@ -19,7 +19,7 @@ from spinning_top_sim.grade.scenes import SCENES, WHEEL, Scene
 
 SENSOR = replace(WHEEL, gyroscope_noise_density=1.7e-4, accelerometer_noise_density=1.2e-3)
 # Parts of the scenes, to be fast; steps of 4 ms make the error of a method as large.
-SHORT = tuple(replace(scene, duration=0.2 * scene.duration, divided=scene.divided[:2])
+SHORT = tuple(replace(scene, duration=0.2 * scene.duration)
               for scene in SCENES if scene.name in ('cusps', 'waves', 'pole', 'fast spin'))
 
 
@@ -91,12 +91,12 @@ def test_rates_of_another_size_are_named_and_the_gyroscope_is_right(size):
     assert report.found[0].number == pytest.approx(size)
 
 
-def test_what_is_held_is_named_and_the_rest_is_graded():
+def test_what_is_held_is_named_and_not_graded():
     def run(*given):
         said = Imu(defect='late')(*given)
         return {**said, 'gyroscope': said['gyroscope'][::2].repeat(2, axis=0)[:len(given[2])]}
 
-    assert {*short(run).faults} == {'held', 'late'}
+    assert short(run).faults == ['held']
 
 
 def test_what_is_too_fast_is_left_out_and_what_cannot_be_seen_is_no_fault():
@@ -110,7 +110,7 @@ def test_what_is_too_fast_is_left_out_and_what_cannot_be_seen_is_no_fault():
 def test_without_rates_those_of_the_attitudes_serve():
     parts = ('accelerations', 'gyroscope')
     for simulator, faults in (
-            (Imu(MOVED['implicit'][0], parts=parts), ['first_order', 'implicit_damping']),
+            (Imu(MOVED['implicit'][0], parts=parts), ['implicit_damping']),
             (Imu(defect='late', parts=parts), ['late']),
             (Imu(MOVED['offset'][0], parts=()), ['com_offset'])):
         assert short(simulator).faults == faults
@@ -125,12 +125,8 @@ def test_what_has_no_cause_is_inaccurate_and_another_motion_in_the_same_run_is_t
     def odd(b):
         return {'accelerations': b.force() + np.sin(np.arange(len(b.w)) / 3.0)[:, np.newaxis]}
 
-    def noisy(b):
-        return {'attitudes': b.q + 1e-9 * b.random.standard_normal(b.q.shape)}
-
-    for simulator, fault in ((Imu(drifting, parts=()), 'inaccurate'), (
-            Imu(defect=odd), 'inaccurate'), (Imu(defect=noisy, parts=()), 'not_deterministic')):
-        assert short(simulator).faults == [fault]
+    for simulator in Imu(drifting, parts=()), Imu(defect=odd):
+        assert short(simulator).faults == ['inaccurate']
 
 
 def test_all_faults_are_in_the_page_and_no_other():
@@ -143,8 +139,7 @@ def test_all_faults_are_in_the_page_and_no_other():
     assert len(names) == len({*names}) and named < {*names}
     # Those without a simulator or a body there have a test of their own, or are causes of causes.
     assert {*names} - named == {
-        'invalid_output', 'not_deterministic', 'inaccurate', 'early', 'gravity', 'matrix',
-        'no_linear_acceleration'}
+        'invalid_output', 'inaccurate', 'early', 'gravity', 'no_linear_acceleration'}
 
 
 def at_rest(t):
@@ -160,7 +155,7 @@ def at_rest(t):
     (lambda t: {'poses': 1}, "has ['poses']: must have attitudes"),
     (lambda t: {'attitudes': at_rest(t), 'rates': 0.0 * at_rest(t)[:, :3] + np.nan},
      '3003 numbers are not finite'),
-    (lambda t: {'attitudes': at_rest(t), 'gyroscope': 'no'}, 'gyroscope: ')])
+    (lambda t: {'attitudes': at_rest(t), 'gyroscope': 'no'}, 'run raises ValueError')])
 def test_what_is_no_motion_is_told(said, says):
     report = grade(lambda top, start, times, dt: said(times), scenes=SHORT[:1])
     assert report.faults == ['invalid_output'] and not report.marks
@@ -168,13 +163,12 @@ def test_what_is_no_motion_is_told(said, says):
 
 
 @pytest.mark.parametrize(('call', 'says'), [
-    (lambda: grade(3), 'run = 3: must be run(top, start, times, dt)'),
-    (lambda: grade(Imu(), dt=0.0), 'dt = 0.0 s: must be in (0, 1]'),
-    (lambda: grade(Imu(), dt=1.0), 'turns by more than 0.7 rad'),
-    (lambda: grade(Imu(), scenes=[]), 'scenes = []: must have one at least'),
+    (lambda: grade(Imu(), dt=0.0), 'dt = 0.0 s: must be positive'),
+    (lambda: grade(Imu(), dt=1.0), 'dt = 1.0 s, 6 scenes: must have one in which'),
+    (lambda: grade(Imu(), scenes=[]), '0 scenes: must have one in which'),
     (lambda: replace(WHEEL, mounting=(1.0, 1.0, 0.0, 0.0)), 'norm must be 1'),
     (lambda: replace(WHEEL, lever_arm=(1.0, 2.0)), 'must be 3 finite numbers'),
     (lambda: replace(WHEEL, mass=-1.0), 'mass = -1.0 kg')])
 def test_wrong_arguments_are_refused(call, says):
-    with pytest.raises((TypeError, ValueError), match=re.escape(says)):
+    with pytest.raises(ValueError, match=re.escape(says)):
         call()

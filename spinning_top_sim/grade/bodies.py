@@ -57,7 +57,9 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
                               'undone'))
         bodies = [undone(body, convention) for body in bodies]
     return Report(subject, faults, {}, notes).plus(*(
-        judge(name, bodies, imu, gravity, placed='positions' in parts) for name in READINGS))
+        judge(name, bodies, imu, gravity) if 'positions' in parts or name != 'accelerations' else
+        Report('', unjudged=[f'{name}: without positions'] * (name in parts))
+        for name in READINGS))
 
 
 def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:

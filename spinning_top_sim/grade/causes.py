@@ -32,7 +32,6 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
-MISSING = 0.05              # share of a whole reading that is none
 # By which a size differs from that of a unit, entries from axes, and from a turn, as a share.
 OF_UNIT, OF_AXES, OF_TURN = 0.02, 0.1, 0.3
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
@@ -42,13 +41,8 @@ ROUNDING = 1e-4             # share of a reading that is no noise
 TELLS = 0.5                 # uncertainty of a share of a term up to which its fault can be told
 
 
-def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
-          placed: bool = True) -> Report:
-    """
-    Return what is wrong with the readings of a kind.
-
-    placed : whether it is known where the origin of the body is
-    """
+def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> Report:
+    """Return what is wrong with the readings of a kind."""
     compared = Comparison(kind, stretches, imu, gravity)
     if not compared.motions:
         return Report(kind, unjudged=[f'{kind}: too few samples'] * (
@@ -56,10 +50,11 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
     samples, sigma, clear = compared.lag()
     late, sigma = samples * compared.steps, sigma * compared.steps
     model = compared.model(round(samples) if clear else 0)
-    found, rest = Causes(compared, model, placed).find()
-    if kind == 'accelerations' and not placed and rest.beyond > max(STRANGE, 2.0 * rest.noise):
-        return Report(kind, unjudged=[f'{kind}: {100.0 * rest.beyond:.3g} % of the reading may be '
-                                      'the acceleration of the origin, without positions'])
+    found, rest = Causes(compared, model).find()
+    if math.isnan(late) and found and found[0].name == 'mounting' and (
+            model.fit(['step']).beyond < UNEXPLAINED * model.fit([]).beyond):
+        return Report(kind, unjudged=[f'{kind}: {found[0].evidence}, or readings are late: this '
+                                      'motion does not tell'])
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
              f'{kind}_discrepancy': Mark(model.fit([]).beyond),
              f'{kind}_noise': Mark(compared.reading_noise), **dict(_estimates(kind, model))}
@@ -86,8 +81,8 @@ def listed(values: Reals) -> str:
 class Causes:
     """What may be wrong with readings; `find` finds what is."""
 
-    def __init__(self, compared: Comparison, model: Model, placed: bool) -> None:
-        self.compared, self.model, self.placed = compared, model, placed
+    def __init__(self, compared: Comparison, model: Model) -> None:
+        self.compared, self.model = compared, model
         self.kind, self.noisy = compared.kind, compared.noisy
         self.arms = [name for name in compared.always if name.startswith('arm')]
         self.strange = max(STRANGE, REAL * self.noisy, OF_STEPS * compared.stepped)
@@ -133,8 +128,7 @@ class Causes:
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
             yield Cause([*(f'in world {arm}' for arm in self.arms), 'total', effect],
                         identify.instead(name, f'the readings are in axes of {text}'))
-        # So many effects fit what the origin does, too; of an unknown field they are no product.
-        if not self.compared.always or (self.arms and self.placed):
+        if self.arms or not self.compared.always:       # of an unknown field it is no product
             yield Cause([f'matrix {i}{j} {of}' for of in (*self.arms, 'total')
                          for i, j in ENTRIES],
                         lambda found: self._matrix(AXES + found[-9:].reshape(3, 3)))
@@ -201,7 +195,7 @@ class Causes:
             name, small = ('rates_scale', STRANGE) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
             return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
-                           'what they should be', matrix[0, 0]) if size > MISSING else None
+                           'what they should be', matrix[0, 0])
         left, _, right = np.linalg.svd(shape)
         turn = left @ right
         if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
@@ -211,11 +205,7 @@ class Causes:
             return Finding('mounting' * (angle > self.strange), 'the readings are in axes that '
                            f'are turned by ({listed(vector)}) rad from those of the IMU{unit}',
                            angle)
-        if self.noisy and self.arms:    # with so many effects noise makes one
-            return None
-        rows = '; '.join(map(listed, matrix))
-        return Finding('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
-                       'times what they should be', change)
+        return None
 
 
 def _difference(found: Reals) -> Finding | None:

@@ -25,17 +25,15 @@ STILL = 1e-5            # share of a reading below which no lag is looked for
 # Terms and effects that any reading may have, along any axes.
 ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field', 'rates'
 _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
-_RATES = {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0, 'dps': math.pi / 180.0,
-          'rpm': math.pi / 30.0}
 # Units of readings with their sizes, SI first.
 READINGS: dict[str, Mapping[str, float]] = {
-    'gyroscope': _RATES,
+    'gyroscope': {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0,
+                  'dps': math.pi / 180.0, 'rpm': math.pi / 30.0},
     'accelerations': {'m/s^2': 1.0, 'm/s2': 1.0, 'g': STANDARD_GRAVITY,
                       'mg': 1e-3 * STANDARD_GRAVITY},
     'magnetometer': {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}}
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
-# Those of a simulator may be the rates of its state, too.
-KINDS = {'rates': _RATES, **READINGS}
+KINDS = {'rates': READINGS['gyroscope'], **READINGS}    # a simulator has those of its state
 OF_TURNS = 'rates', 'gyroscope'
 DENSITIES = {'gyroscope': 'gyroscope_noise_density',
              'accelerations': 'accelerometer_noise_density'}
@@ -80,17 +78,7 @@ class Imu:
 
 
 class Comparison:
-    """
-    Readings of a kind beside a motion, which is smoothed as far as the noise asks for.
-
-    always : names of effects whose size is not known, even of a right reading
-    arm : as given, or as found
-    sizes : rms of the readings of each stretch, over which they are compared
-    own_step, steps : interval of the sensor [s], and its samples per sample that is compared
-    motions : of each stretch, smoothed, and the same with as much noise again; none: too short
-    noisy, stepped : whether the noise of the motion counts; it is that of a simulator, whose rates
-        are not known
-    """
+    """Readings of a kind beside motions, smoothed as far as their noise asks for."""
 
     def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float,
                  widths: Sequence[int] = kinematics.WIDTHS) -> None:
@@ -102,8 +90,10 @@ class Comparison:
         self.mounting = Rotation.from_quat((0, 0, 0, 1) if kind == 'rates' else imu.mounting)
         stretches = [one for one in stretches if kind in one.readings]
         sizes = [rms(one.readings[kind]) for one in stretches]
-        self.sizes = np.maximum(sizes, 0.1 * max(sizes, default=0.0) or 1.0)    # one may rest
-        self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
+        least = 0.1 if kind in OF_TURNS else 0.01       # at rest there are no rates, but gravity
+        self.sizes = np.maximum(sizes, least * max(sizes, default=0.0) or 1.0)
+        self.reading_noise = rms(np.array([one.sigma.get(kind, 0.0) for one in stretches] or [0]))
+        # The interval of the sensor [s], and its samples per sample that is compared.
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
         self.stepped = any(one.rates is None and not one.intervals for one in stretches)
@@ -138,15 +128,10 @@ class Comparison:
         return (motion.rate if self.kind in OF_TURNS else motion.vector)(reading)
 
     def lag(self) -> tuple[float, float, bool]:
-        """
-        Return by how many samples readings are late, its deviation, and whether it explains much.
-
-        The reading is regressed on all terms, of all axes, at each lag: what else is wrong does
-        not count.
-        """
+        """Return by how many samples readings are late, its deviation, and whether it is sure."""
         motions, residuals = [one for one, _ in self.motions], []
         lags = [lag for lag in LAGS if 4 * abs(lag) < min(len(one.rates) for one in motions)]
-        for motion in motions:
+        for motion in motions:      # by all terms, of all axes: what else is wrong does not count
             good = np.flatnonzero(motion.smooth)
             good = good[(good >= -lags[0]) & (good < len(motion.smooth) - lags[-1])]
             design = np.hstack([effect[good] for name, effect in self.columns(motion).items()

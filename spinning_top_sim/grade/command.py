@@ -73,8 +73,7 @@ def _run(arguments: argparse.Namespace) -> int:
     imu = Imu(lever_arm=arguments.lever_arm or known.get('imu.lever_arm'),
               field=known.get('mag.field'),
               mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
-              **{name: given.get(f'imu.{name}', recorded.densities.get(kind))
-                 for kind, name in DENSITIES.items()})
+              **{name: given.get(f'imu.{name}') for name in DENSITIES.values()})
     report = Report(arguments.file.name, notes=recorded.notes).plus(grade_readings(
         parts, imu, gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY))
     if of_top:
@@ -107,7 +106,7 @@ def _of_motion(recorded: Recorded, values: Mapping[str, Any], run: Any) -> Repor
         notes.append('another start than the one that is given: it is read off the first samples')
         body = replace(body, t=body.t - body.t[at])
     judgement = Judgement(top, body.step, tolerance)
-    judgement.motions.append(judgement.beside_truth('the motion', start, body))
+    judgement.add('the motion', start, body)
     return Report('', judgement.faults, {}, notes).plus(*judgement.reports())
 
 

@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ import numpy as np
 
 from spinning_top_sim.grade.columns import LENGTHS, NORM, READINGS
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.table import Columns, read_columns
 from spinning_top_sim.times import stamp_text
 from spinning_top_sim.tools import recorded_run
@@ -32,17 +30,16 @@ from spinning_top_sim.tools.kinematics import Reals
 
 # Columns of each part of a motion, and factors of their units by name, the first by default.
 PARTS: dict[str, tuple[Sequence[str], Mapping[str, Any]]] = {
-    't': (['t'], {'s': 10 ** 9, 'ms': 10 ** 6, 'us': 10 ** 3, 'ns': 1, 'iso': 10 ** 9}),
+    't': (['t'], {'s': 10 ** 9, 'ms': 10 ** 6, 'us': 10 ** 3, 'ns': 1}),
     'attitudes': (['qx', 'qy', 'qz', 'qw'], {'1': 1.0}),
     'positions': (['px', 'py', 'pz'], LENGTHS),
     **{name: ([f'{letter}{axis}' for axis in 'xyz'], READINGS[name])
        for name, letter in zip(READINGS, 'gam', strict=True)}}
 UNITS = {name: units for names, units in PARTS.values() for name in names}
-# The end of a name in brackets; a unit in them, no index; what resembles one of our names; dates.
+# The end of a name in brackets; a unit in them, no index; what resembles one of our names.
 BRACKETS = re.compile(r'\s*[\[({][^\])}]*[\])}]$')
 UNIT = re.compile(r'[\[({](?!\d+\W)([^\])}]*)[\])}]$')
 ALIKE = re.compile(r'(?<![a-z0-9])([pqgam])[^a-z0-9]?([wxyz])(?![a-z0-9])')
-DATE = re.compile(r'^(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(\.\d+)?(Z|[-+]\d\d:?\d\d)?$')
 # Columns of TUM, maybe without names, and our names; our names of EuRoC's without their units.
 OF_TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
 TUM = ['timestamp', 'tx', 'ty', 'tz', *OF_TUM[4:]], [f'column {k}' for k in range(1, 9)]
@@ -58,34 +55,20 @@ Chosen = dict[str, list[tuple[str, str]]]       # by our name: columns and their
 
 @dataclass
 class Recorded:
-    """
-    What is in a file.
-
-    parts : times (n,), ascending [s], and values (n, k) by names of PARTS, SI; attitudes are
-        q(world <- body) as x, y, z, w
-    origin : the stamp at which times begin [ns]
-    notes : what was read, and what was not
-    densities : of the noise that the first message of an IMU declares, by name
-    run : of a log of this package, as `recorded_run` describes it
-    """
+    """What is in a file, with notes: times (n,) [s] and values (n, k) by names of PARTS, SI."""
 
     parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
-    origin: Any = None
+    origin: Any = None          # the stamp at which times begin [ns]
     notes: list[str] = field(default_factory=list)
-    densities: dict[str, float] = field(default_factory=dict)
-    run: Any = None
+    run: Any = None             # of a log of this package, as `recorded_run` describes it
 
     def add(self, kind: str, source: str, stamps: Any, values: Reals,
             rows: Sequence[str]) -> None:
-        """
-        Add a part: exact stamps [ns], values (n, k), NaN: none, and what each row is called.
-
-        Raises ValueError.
-        """
+        """Add a part: exact stamps [ns], values, NaN: none, and names of rows.  ValueError."""
         at = np.flatnonzero(np.all(np.isfinite(values), axis=1))
         if self.origin is None and len(at):
             self.origin = stamps[at[0]]
-            first = (Decimal(self.origin) / 10 ** 9).normalize()
+            first = Decimal(self.origin).scaleb(-9).normalize()
             self.notes.append(f'the first time is {first:f} s')
         times = 1e-9 * np.array([float(stamps[row] - self.origin) for row in at])
         steps, same = np.diff(times), np.all(np.diff(values[at], axis=0) == 0.0, axis=1)
@@ -168,11 +151,9 @@ def _add_log(recorded: Recorded, path: Path, wanted: Sequence[str]) -> list[str]
         found = samples(reader, end_ns)
         unused = {topic.name for topic in reader.topics if topic.type_name not in PLACES}
     sources = {name for every in found.values() for name in every}
-    moving = {name for every in found.values() for name, rows in every.items()
-              if any(row.values != rows[0].values for row in rows)}
     for name in {*wanted} - sources:
         raise ValueError(f'--topic {name}: the log has {", ".join(sorted(sources)) or "none"}')
-    groups = wanted, *([one] for one in ours), moving, sources.copy()
+    groups = wanted, *([one] for one in ours), sources.copy()
     for kind, every in found.items():
         here = next(filter(None, ([name for name in every if name in group] for group in groups)))
         if len(here) > 1:
@@ -182,19 +163,11 @@ def _add_log(recorded: Recorded, path: Path, wanted: Sequence[str]) -> list[str]
         recorded.add(kind, here[0], [row.stamp_ns for row in rows],
                      np.array([row.values for row in rows]),
                      [f'message {k}' for k in range(len(rows))])
-        covariance = rows[0].covariance         # zeros: unknown; the smallest: exact
-        if covariance is not None and np.max(covariance) > EXACT_VARIANCE:
-            recorded.densities[kind] = math.sqrt(np.trace(covariance.reshape(3, 3)) / 3.0
-                                                 * np.median(np.diff(recorded.parts[kind][0])))
     return sorted(unused | sources)
 
 
 def columns_said(text: str) -> Chosen:
-    """
-    Return the columns that 't=sec:s+nanosec:ns, qw=rot_0, az=' says; none: not in the file.
-
-    Those of times are added up.  Raises ValueError.
-    """
+    """Return the columns that 't=sec:s+nanosec:ns, qw=rot_0, az=' says; none: left out."""
     said: Chosen = {}
     text = Path(text).read_text('utf-8') if text and '=' not in text else text
     for item in filter(str.strip, re.split(r'[,\n]', text)):
@@ -226,8 +199,7 @@ def _chosen(columns: Columns, said: Chosen, wanted: Sequence[str]) -> Chosen:
             alike.setdefault(like[1] + like[2], []).append(column)
         name = BRACKETS.sub('', column)
         if name in UNITS and name not in said:
-            with contextlib.suppress(ValueError):       # of an unknown unit
-                chosen[name] = [_column(name, column), *chosen.get(name, ())]
+            chosen[name] = [_column(name, column), *chosen.get(name, ())]
     unclear = [
         name for kind, (names, _) in PARTS.items()
         if kind in wanted or any(chosen.get(name, name in alike) for name in names)
@@ -261,27 +233,15 @@ def _add(recorded: Recorded, columns: Columns, rows: Sequence[str], said: Chosen
 
 
 def _numbers(rows: Sequence[str], column: str, cells: Sequence[Any], unit: str) -> Any:
-    """Return a column (n,).  Raises ValueError."""
-    found = []
+    """Return a column (n,), times exactly, where a cell is empty NaN.  Raises ValueError."""
+    found, is_time = [], unit in UNITS['t']
     for row, cell in zip(rows, cells, strict=True):
         text = '' if cell is None else str(cell).strip()
         try:
-            found.append(_number(text, unit))
+            number = Decimal(text) if is_time else float(text or 'nan')
         except (ArithmeticError, ValueError):
-            right = 'date such as 2026-01-31T12:00:00.5' if unit == 'iso' else (
-                'number such as -12.5'
-                + " (of dates say --columns 't=COLUMN:iso')" * (unit in UNITS['t']))
-            raise ValueError(f'{row}: {column} = {text[:40]!r}: must be a {right}') from None
+            number = math.inf
+        if '_' in text or math.isinf(number) or (math.isnan(number) and is_time):
+            raise ValueError(f'{row}: {column} = {text[:40]!r}: must be a number such as -12.5')
+        found.append(number)
     return np.array(found)
-
-
-def _number(text: str, unit: str) -> Decimal | float:
-    """Return the number in a cell, of a time exactly; empty: NaN.  Raises ValueError."""
-    if unit == 'iso':
-        ((day, fraction, zone),) = DATE.findall(text)
-        return Decimal(fraction or 0) + int(datetime.fromisoformat(
-            day + (zone or 'Z')).timestamp())
-    number = Decimal(text) if unit in UNITS['t'] else float(text or 'nan')
-    if '_' in text or math.isinf(number) or (math.isnan(number) and unit in UNITS['t']):
-        raise ValueError
-    return number

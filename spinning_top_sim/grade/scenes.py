@@ -80,19 +80,15 @@ class Scene:
         l3, lz, theta and theta_dot, those that are not 0.
     duration : float
         Length [s].
-    divided : tuple of int
-        Divisors of dt, 1 first; several give the order of convergence.
     """
 
     name: str
     start: Mapping[str, float]
     duration: float
-    divided: tuple[int, ...] = (1,)
 
-    def start_of(self, top: Top, seed: int) -> Start:
-        """Return the start; the seed determines phi and psi."""
-        phi, psi = np.random.default_rng(seed).uniform(-np.pi, np.pi, 2).tolist()
-        return Start.of(top, State(phi=phi, psi=psi, **self.start))
+    def start_of(self, top: Top) -> Start:
+        """Return the start, along no axes of the world."""
+        return Start.of(top, State(phi=0.861, psi=-1.447, **self.start))
 
 
 # The bicycle wheel of config/cusp.yaml, with an IMU off its axis.
@@ -102,9 +98,9 @@ WHEEL = Body(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=S
 TILT = math.radians(30.0)
 # As in config/, but for the last two: one passes the upward vertical, one spins at 60 rad/s.
 SCENES = (
-    Scene('cusps', {'theta': TILT, 'l3': 1.6, 'lz': 1.6 * math.cos(TILT)}, 10.0, (1, 2, 4)),
+    Scene('cusps', {'theta': TILT, 'l3': 1.6, 'lz': 1.6 * math.cos(TILT)}, 10.0),
     Scene('waves', {'theta': TILT, 'l3': 1.6, 'lz': 1.42}, 4.0),
     Scene('loops', {'theta': TILT, 'l3': 1.6, 'lz': 1.3}, 4.0),
     Scene('near the separatrix', {'theta': 1.179087, 'l3': 1.0, 'lz': 1.0}, 4.0),
     Scene('pole', {'theta': 0.6, 'theta_dot': -4.0, 'l3': 1.0, 'lz': 1.0}, 4.0),
-    Scene('fast spin', {'theta': TILT, 'l3': 9.0, 'lz': 9.0 * math.cos(TILT)}, 2.0, (1, 2, 4)))
+    Scene('fast spin', {'theta': TILT, 'l3': 9.0, 'lz': 9.0 * math.cos(TILT)}, 2.0))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.bodies import held
+from spinning_top_sim.grade.bodies import held, undone
 from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, judge, listed
 from spinning_top_sim.grade.columns import AXES, KINDS, NORM, READINGS, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
@@ -37,10 +37,9 @@ SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
 def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
-          scenes: Sequence[Scene] = SCENES, seed: int = 0, tolerance: float = TOLERANCE,
-          subject: str | None = None) -> Report:
+          scenes: Sequence[Scene] = SCENES, tolerance: float = TOLERANCE) -> Report:
     """
-    Grade a simulator.
+    Grade a simulator.  ValueError: dt is not positive, or so long that no scene can be graded.
 
     Parameters
     ----------
@@ -51,43 +50,31 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
         body (n, 3) [rad/s], `gyroscope`, `accelerations`, `magnetometer`, readings in the frame
         of the IMU (n, 3), SI.  The first time is 0, and all are multiples of dt.
     dt : float
-        The step [s].  Samples are dt apart, also where the order of convergence is measured with
-        smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
+        The step [s].  A scene in which the top turns by more than 0.7 rad in it is left out.
     body, scenes : Body, sequence of Scene
         The top with an IMU, and its motions.
-    seed : int
-        Determines how the top is turned at the start.
     tolerance : float
         Largest error of an attitude that is no fault [rad].
-    subject : str, optional
-        Name of the simulator; default: that of `run`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        Naming the argument, its value and what is allowed.
     """
-    if not callable(run):
-        raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
-    if not 0.0 < dt <= 1.0:
-        raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
-    if not scenes:
-        raise ValueError(f'scenes = {scenes!r}: must have one at least')
+    if not dt > 0.0:
+        raise ValueError(f'dt = {dt!r} s: must be positive')
     judgement, unjudged = Judgement(body, dt, tolerance), list[str]()
     with progress('graded', len(scenes), 'scenes') as show:
         for number, scene in enumerate(scenes):
             show(number)
-            start = scene.start_of(body, seed)
+            start = scene.start_of(body)
             if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
                 unjudged.append(f'{scene.name}: the top turns by more than {MOST:g} rad in a step')
                 continue
+            times: Reals = np.arange(math.floor(scene.duration / dt + 1e-9) + 1.0) * dt
             try:
-                judgement.run(run, scene, start)
+                judgement.add(scene.name, start, told_motion(run, body, start, times, dt))
             except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
     if len(unjudged) == len(scenes):
-        raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
-    subject = one_line(subject or getattr(run, '__name__', type(run).__name__))
+        raise ValueError(f'dt = {dt!r} s, {len(scenes)} scenes: must have one in which the top '
+                         f'turns by at most {MOST:g} rad in a step')
+    subject = one_line(getattr(run, '__name__', type(run).__name__))
     notes = ['no readings: the IMU is not graded'] * bool(
         judgement.motions and READINGS.keys().isdisjoint(judgement.motions[0].told.readings))
     return Report(subject, judgement.faults, notes=notes, unjudged=unjudged).plus(
@@ -98,22 +85,18 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
     """Return the motion that a run says.  Raises ValueError."""
     try:
         said = run(body, start, times.copy(), dt)
+        said = said if isinstance(said, Mapping) else {'attitudes': said}
+        readings: dict[str, Reals] = {name: np.array(said[name], dtype=float) for name in (
+            'attitudes', *KINDS) if said.get(name) is not None}
     except (Exception, SystemExit) as error:
         raise ValueError(f'run raises {type(error).__name__}: {one_line(error)}') from error
-    said = said if isinstance(said, Mapping) else {'attitudes': said}
-    readings: dict[str, Reals] = {}
-    for name in ('attitudes', *KINDS):
-        if said.get(name) is not None:
-            try:
-                readings[name] = values = np.array(said[name], dtype=float)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f'{name}: {error}') from error
-            shape, bad = (len(times), 4 if name == 'attitudes' else 3), ~np.isfinite(values)
-            if values.shape != shape or np.any(bad):
-                raise ValueError(f'{name} has shape {values.shape}, {np.sum(bad)} numbers are not '
-                                 f'finite: must be {shape}, all finite')
     if 'attitudes' not in readings:
         raise ValueError(f'what is returned has {[*said]}: must have attitudes')
+    for name, values in readings.items():
+        shape, bad = (len(times), 4 if name == 'attitudes' else 3), ~np.isfinite(values)
+        if values.shape != shape or np.any(bad):
+            raise ValueError(f'{name} has shape {values.shape}, {np.sum(bad)} numbers are not '
+                             f'finite: must be {shape}, all finite')
     attitudes = readings.pop('attitudes')
     for at in np.flatnonzero(np.abs(np.linalg.norm(attitudes, axis=1) - 1.0) > NORM)[:1]:
         raise ValueError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm must be 1')
@@ -129,7 +112,6 @@ class Motion:
     told: Stretch
     worst: float                # its largest angle to the exact attitudes [rad]
     slow: bool                  # whether it is the right motion at another rate, at first
-    order: float = math.nan     # p of errors ~ dt^p
 
 
 class Judgement:
@@ -140,40 +122,22 @@ class Judgement:
         self.motions: list[Motion] = []
         self.faults: list[Finding] = []
 
-    def run(self, run: Simulate, scene: Scene, start: Start) -> None:
-        """Add the motion of a scene.  Raises ValueError."""
-        times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
-        told = [told_motion(run, self.body, start, times, self.dt / divided)
-                for divided in scene.divided]
-        if not self.motions and not np.array_equal(told[0].matrices, told_motion(
-                run, self.body, start, times, self.dt).matrices):
-            self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
-                                       'same run twice differ'))
-        readings = {'attitudes': told[0].rotation.as_quat(), **told[0].readings}
-        holds = {name: hold for name, values in readings.items()
-                 for hold in held(f'{scene.name}: {name}', values)[1]}
-        self.faults += holds.values()
-        if 'attitudes' in holds:                # what is held is not graded
-            return
-        told[0].readings = {name: one for name, one in told[0].readings.items()
-                            if name not in holds}
-        same = [self.beside_truth(scene.name, start, one) for one in told]
-        self.motions.append(same[0])
-        errors = [one.worst for one in same]
-        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding
-            same[0].order = -float(np.polyfit(np.log(scene.divided), np.log(errors), 1)[0])
-
-    def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
-        """Return a motion; a convention of its attitudes, or a step, is told and undone."""
+    def add(self, name: str, start: State, told: Stretch) -> None:
+        """Add a motion; a convention of its attitudes, or a step, is told and undone."""
+        values = {'attitudes': told.rotation.as_quat(), **told.readings}
+        if holds := [hold for kind in values
+                     for hold in held(f'{name}: {kind}', values[kind])[1]]:
+            self.faults += holds
+            return                              # the motion is no better known
         solution = ExactSolution(self.body, start)
         truth = solution.states(told.t)
-        q, exact = told.rotation.as_quat(), Rotation.from_quat(truth.quaternion)
+        q, exact = values['attitudes'], Rotation.from_quat(truth.quaternion)
         found = conventions.best(q[:EARLY], truth.quaternion[:EARLY]) if np.max(
             (exact.inv() * told.rotation).magnitude()[:EARLY]) > WRONG else None
         if found and found.convention.parts and found.after < RIGHT * found.before:
             self.faults.append(Finding('convention', f'{name}: attitudes are told as '
                                        f'{found.convention.name}; this is undone', found.before))
-            told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
+            told = undone(told, found.convention)
         # A lag and another rate of the clock turn about the rates.
         errors, w = (exact.inv() * told.rotation).as_rotvec(), truth.angular_velocity[:EARLY]
         model = Model([{TARGET: errors[:EARLY], 'late': -self.dt * w,
@@ -185,8 +149,8 @@ class Judgement:
                 'late' if late > 0.0 else 'early', f'{name}: the attitudes are those of '
                 f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
             exact = Rotation.from_quat(solution.states(told.t - late * self.dt).quaternion)
-        return Motion(name, told, float(np.max((exact.inv() * told.rotation).magnitude())),
-                      explained and abs(late) < LATE)
+        worst = float(np.max((exact.inv() * told.rotation).magnitude()))
+        self.motions.append(Motion(name, told, worst, explained and abs(late) < LATE))
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
@@ -200,49 +164,39 @@ class Judgement:
                 motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
         yield Report('', of_rates)
         yield Report('', [one for one in self._of_motions() if not (
-            scaled and one.name == 'inaccurate')], {
-                name: mark for motion in self.motions for name, mark in self._marks(motion)})
+            scaled and one.name == 'inaccurate')])
+        yield from map(self._marks, self.motions)
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
         return judge(kind, [one.told for one in self.motions], self.body, self.body.gravity)
 
-    def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
-        """Yield the largest error, the relative change of the energy, and the order."""
-        yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
-                                                      math.degrees(self.tolerance))
-        smoothed = Smoothed(motion.told, 1)
+    def _marks(self, motion: Motion) -> Report:
+        """Return the largest error, and the relative change of the energy."""
+        smoothed, limit = Smoothed(motion.told, 1), math.degrees(self.tolerance)
         energy = (0.5 * smoothed.rates ** 2 @ self.body.inertia
                   + self.body.gravity_torque * smoothed.turn[:, 2, 2])
-        yield f'energy_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
-            energy, float(energy[0]))))))
-        yield f'order: {motion.name}', Mark(motion.order)
+        drift = np.max(np.abs(relative_drift(energy, float(energy[0]))))
+        return Report('', marks={
+            f'total_error_deg: {motion.name}': Mark(math.degrees(motion.worst), limit),
+            f'energy_drift: {motion.name}': Mark(float(drift))})
 
     def _of_motions(self) -> Iterator[Finding]:
         worst = max(self.motions, key=lambda motion: motion.worst)
         if worst.worst <= self.tolerance:
             return
         text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        found = [Finding('first_order', f'{one.name}: the error falls as dt^{one.order:.2f}',
-                         one.order) for one in self.motions if 0.5 < one.order < 1.5][:1]
-        if not worst.slow:
-            found += [one for one in _equations(
-                self.body, [motion.told for motion in self.motions], self.dt)
-                if one.name not in [first.name for first in found]]
+        found = [] if worst.slow else _equations(
+            self.body, [motion.told for motion in self.motions])
         yield from (one._replace(evidence=f'{text}; {one.evidence}') for one in found)
         if not found:
             yield Finding('inaccurate', text + '; it turns at other rates from the start on' * (
                 worst.slow), math.degrees(worst.worst))
 
 
-def _equations(body: Body, motions: Sequence[Stretch], dt: float) -> list[Finding]:
-    """
-    Return what is wrong with the equations of motion, or with steps.
-
-    The change of rates in each step is compared with what gravity and the gyroscopic term, both of
-    the same attitudes and rates, would cause: errors do not add up there.
-    """
-    model = Model([_terms(body, motion, dt) for motion in motions])
+def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
+    """Return what is wrong with the change of rates in each step, where no errors add up."""
+    model = Model([_terms(body, motion) for motion in motions])
     if model.size(TARGET) < UNIMPORTANT:
         return []
     found, rest = explain(model, [
@@ -256,10 +210,10 @@ def _equations(body: Body, motions: Sequence[Stretch], dt: float) -> list[Findin
     return found if rest.rest < EXPLAINED * model.size(TARGET) else []
 
 
-def _terms(body: Body, motion: Stretch, dt: float) -> dict[str, Reals]:
+def _terms(body: Body, motion: Stretch) -> dict[str, Reals]:
     """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
     smoothed = Smoothed(motion, 1)
-    step, w, inertia = motion.step, smoothed.rates, body.inertia
+    w, inertia = smoothed.rates, body.inertia
     z, world = smoothed.turn[:, 2], along(smoothed.turn, w)
     gyroscopic = -np.cross(w, w * inertia) / inertia
     arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in AXES]
@@ -275,8 +229,8 @@ def _terms(body: Body, motion: Stretch, dt: float) -> dict[str, Reals]:
     effects = {name: np.tensordot(_MEAN, [node[at:len(node) - 5 + at] for at in range(6)], 1)
                for name, node in nodes.items()}
     for name in ('gyroscopic', 'gravity'):
-        effects[f'{name} step'] = dt / step * np.diff(nodes[name], axis=0)[2:-2]
-    change = np.diff(w, axis=0)[2:-2] / step
+        effects[f'{name} step'] = np.diff(nodes[name], axis=0)[2:-2]
+    change = np.diff(w, axis=0)[2:-2] / motion.step
     effects[TARGET] = change - effects['gyroscopic'] - effects['gravity']
     size = rms(change) or 1.0
     return {name: effect / size for name, effect in effects.items()}

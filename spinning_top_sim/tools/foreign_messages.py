@@ -25,7 +25,7 @@ LAYOUTS = {
     'geometry_msgs/msg/PoseStamped': ('pose.orientation', ''),
     'geometry_msgs/msg/PoseWithCovarianceStamped': ('pose.pose.orientation', 'pose.covariance'),
     'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'pose.covariance')}
-# By type: where positions and attitudes are; of readings also their covariances.
+# By type: where positions, attitudes and readings are.
 _POSE = {'positions': 'pose.pose.position', 'attitudes': 'pose.pose.orientation'}
 _TRANSFORM = {'positions': 'transform.translation', 'attitudes': 'transform.rotation'}
 PLACES = {
@@ -39,11 +39,10 @@ PLACES = {
 
 
 class Sample(NamedTuple):
-    """Numbers in a message, its stamp [ns], and their covariance, if there is one."""
+    """Numbers in a message, and its stamp [ns]."""
 
     stamp_ns: int
     values: list[float]
-    covariance: NDArray[np.float64] | None
 
 
 @cache
@@ -108,6 +107,5 @@ def samples(reader: LogReader, end_ns: int) -> dict[str, dict[str, list[Sample]]
                 if covariance is None or covariance[0] != NO_ORIENTATION:   # there is a reading
                     vector = attrgetter(place)(one)
                     found[part][source].append(Sample(stamp, [
-                        getattr(vector, axis) for axis in 'xyzw' if hasattr(vector, axis)],
-                        covariance))
+                        getattr(vector, axis) for axis in 'xyzw' if hasattr(vector, axis)]))
     return found

@@ -170,12 +170,12 @@ DEFECTS = {
 NOISY = 'density as deviation',
 MOVED = {
     # avianphysics/avian#420: the term of the begin of a step adds energy.
-    'explicit': (partial(stepped, method='explicit'), ('first_order', 'explicit_gyroscopic_term')),
+    'explicit': (partial(stepped, method='explicit'), ('explicit_gyroscopic_term',)),
     # bulletphysics/bullet3#346: that of its end damps.
-    'implicit': (partial(stepped, method='implicit'), ('first_order', 'implicit_damping')),
+    'implicit': (partial(stepped, method='implicit'), ('implicit_damping',)),
     # google-deepmind/mujoco_warp#1662: the derivative has the wrong sign.
     'wrong derivative': (partial(stepped, method='wrong derivative'),
-                         ('first_order', 'coriolis_sign')),
+                         ('coriolis_sign',)),
     'midpoint': (partial(stepped, method='midpoint'), ('first_order',)),
     # godotengine/godot#80703, NVIDIAGameWorks/PhysX#394, jrouwe/JoltPhysics#803, google/brax#48.
     'no gyroscopic term': (partial(euler, gyroscopic=0.0), ('no_gyroscopic_term',)),
