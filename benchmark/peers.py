@@ -22,6 +22,7 @@ from cases import Case
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
+from spinning_top_sim.times import NANOSECONDS
 
 
 class FailedError(Exception):
@@ -98,7 +99,7 @@ class _Ours(Runner):
 
     def _states(self, ns):
         propagator = motion_of(self.case.top, self.case.start, **self._options)
-        states = propagator.states(ns)
+        states = propagator.states(ns, NANOSECONDS)
         self.work = propagator.evaluations or None
         return states
 
@@ -113,7 +114,8 @@ class _Ours(Runner):
 class _ExactGrid(Runner):
     def attitudes(self, ns):
         solution = ExactSolution(self.case.top, self.case.start)
-        return solution.states(range(0, int(ns[1]) * len(ns), int(ns[1]))).quaternion
+        return solution.states(range(0, int(ns[1]) * len(ns), int(ns[1])),
+                               NANOSECONDS).quaternion
 
 
 def attitudes_of_angles(theta, phi, psi) -> np.ndarray:

@@ -30,6 +30,7 @@ from truth import angles_between, long_attitudes
 
 from spinning_top_sim import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.times import NANOSECONDS
 
 DURATION, RATE = 10, 64
 # Limits are processor times; this factor is the limit of real time.
@@ -106,7 +107,7 @@ def meet(case: Case, name: str, setting: float) -> str:
         return 'refused'
     if not np.all(np.isfinite(samples.quaternion)):
         return 'NaN'
-    exact = case.exact.states(ns)
+    exact = case.exact.states(ns, NANOSECONDS)
     if name.startswith('exact'):
         if peer('heyoka quadratic').missing():
             return 'not judged'
@@ -157,7 +158,8 @@ def follow(case: Case, name: str, setting: float) -> tuple[np.ndarray, ...]:
     """Return the errors of the attitude, E, L3 and Lz over an hour, the last three relative."""
     ns = grid_ns(HOUR, HOUR_RATE)
     samples = peer(name).ready(case, setting).samples(ns)
-    truth = case.exact.states(range(0, int(ns[-1]) + 1, int(ns[1]))).quaternion
+    truth = case.exact.states(
+        range(0, int(ns[-1]) + 1, int(ns[1])), NANOSECONDS).quaternion
     energy, l3, lz = samples.invariants(case)
     scale = case.top.gravity_torque, case.start.l3, case.start.lz
     return (angles_between(samples.quaternion, truth),

@@ -28,6 +28,7 @@ from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
 from truth import BITS, angles_between, long_attitudes
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.times import NANOSECONDS
 
 CASES = (*WORK_PRECISION, TOY_200)
 REFERENCE = ('SciPy DOP853', 1e-9)
@@ -91,7 +92,7 @@ def _missing() -> str:
 def measure(case: Case) -> list[Row]:
     """Run every method at every setting once for its error, then ROUNDS times for its time."""
     ns = grid_ns(DURATION, RATE)
-    truth = case.exact.states(ns).quaternion
+    truth = case.exact.states(ns, NANOSECONDS).quaternion
     runs: dict[object, Callable[[], object]] = {}
     rows = []
     for peer, setting in ((p, s) for p in PEERS if not p.missing() for s in p.settings):
