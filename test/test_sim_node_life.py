@@ -2,6 +2,9 @@
 """How a node in this process bears overload, stalled readers and full disks."""
 
 import errno
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -82,3 +85,13 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
     errors = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
     assert ['not recording' in line for line in errors] == 3 * [True]
     assert precious.read_bytes() == b'precious'
+
+
+def test_a_reader_of_the_status_that_stalls_holds_nothing_up():
+    program = ('from spinning_top_sim.nodes.executable import tell\n'
+               'for _ in range(3000): tell(99 * "x")')
+    for reading, writing in (os.pipe(), os.openpty()):
+        subprocess.run([sys.executable, '-c', program], stdout=writing, timeout=60.0, check=True)
+        assert os.get_blocking(writing) and os.read(reading, 100).split() == [99 * b'x']
+        os.close(reading)
+        os.close(writing)
