@@ -152,7 +152,9 @@ def test_a_failed_motion_is_paused_until_it_is_stopped_and_quitting_ends_the_nod
         OK, QUITTING, ALREADY)
     assert top.set_state('PLAYING') == INCORRECT_TRANSITION
     assert top.refused('ResetSimulation', scope=0)[0] == INCORRECT_STATE
-    assert top.trigger('reset').message == 'at the end: nothing follows'
+    refused = top.trigger('reset').message, top.set(step__dt=0.02, pose__enabled=False).reason
+    assert {*refused} == {'at the end: nothing follows'} and top.state == QUITTING
+    assert [one for one in top.node.publishers if one.topic_name == '/pose']
     top.spin_until('the end', top.node.finished.done)
     assert top.node.finished.result() is None       # exit code 0
 

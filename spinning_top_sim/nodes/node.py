@@ -183,16 +183,15 @@ class Simulator(Node):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
         try:                # what may be refused comes first
-            if others:
-                self._topics.open(values)
+            self._topics.open(values)
             if command:
                 self._command(command)
+            if others:
+                self.loop.set_parameters(values, {name: values[name] for name in sorted(
+                    others.keys() - SPIN)})
         except Exception:
             self._topics.open(self.values_next)
             raise
-        if others:
-            self.loop.set_parameters(values, {name: values[name] for name in sorted(
-                others.keys() - SPIN)})
         self.values_next = values
         if others:
             self._align_ticks()
