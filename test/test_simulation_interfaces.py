@@ -152,8 +152,10 @@ def test_a_failed_motion_is_paused_until_it_is_stopped_and_quitting_ends_the_nod
         OK, QUITTING, ALREADY)
     assert top.set_state('PLAYING') == INCORRECT_TRANSITION
     assert top.refused('ResetSimulation', scope=0)[0] == INCORRECT_STATE
-    refused = top.trigger('reset').message, top.set(step__dt=0.02, pose__enabled=False).reason
-    assert {*refused} == {'at the end: nothing follows'} and top.state == QUITTING
+    for refused in (top.trigger('reset').message, top.switch('set_pause', False).message,
+                    top.set(step__dt=0.02, pose__enabled=False).reason,
+                    top.set(spin__l3=2.0).reason):
+        assert (refused, top.state) == ('at the end: nothing follows', QUITTING)
     assert [one for one in top.node.publishers if one.topic_name == '/pose']
     top.spin_until('the end', top.node.finished.done)
     assert top.node.finished.result() is None       # exit code 0

@@ -28,7 +28,7 @@ class LoopState(Enum):
     ENDED = 'at the end: nothing follows'
 
 
-STANDING = LoopState.WAITING, LoopState.FAILED     # no motion goes on there
+STANDING = LoopState.WAITING, LoopState.FAILED, LoopState.ENDED     # no motion goes on there
 
 
 class Loop:
