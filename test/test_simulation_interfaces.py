@@ -232,7 +232,10 @@ def test_a_bad_state_changes_nothing(top):
 
 def test_before_the_clock_and_after_the_end_nothing_can_be_set(tmp_path):
     with StandardNode(tmp_path, use_sim_time=True) as top:
-        assert top.state == STOPPED and top.set_state('PLAYING') == TRANSITION_ERROR
+        top.loop.paused = False
+        for state in ('PLAYING', 'PAUSED'):
+            assert (top.set_state(state), top.state) == (TRANSITION_ERROR, STOPPED)
+        assert not top.loop.paused
         assert top.refused('StepSimulation', steps=1) == (
             INCORRECT_STATE, 'waiting for /clock (use_sim_time is set)')
     with StandardNode(tmp_path, duration=0.05) as top:
