@@ -154,6 +154,7 @@ class Recorder:
             self.error = text_of(error) if self.path is None else (
                 f'recording to {self.path} stopped: {reason_of(error)}')
             self.state = 'failed'
+            self._taken.set()
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
                 if self._syncing is not None:
