@@ -5,6 +5,7 @@ import errno
 import os
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -73,6 +74,9 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
         assert not answer.success and 'exists' in answer.message
         assert not any(one.is_used for one in node.simulation.outputs)
         assert node.set(record__uri=f'{tmp_path}/new/er.mcap/').successful
+        with monkeypatch.context() as patch:
+            patch.setattr('threading.Thread.start', Mock(side_effect=RuntimeError('no thread')))
+            assert node.switch('record', True).message == 'no thread'
         answers = [node.switch('record', True).message for _ in range(2)]
         (path,) = (tmp_path / 'new/er.mcap').iterdir()
         assert answers == 2 * [f'recording to {path}']

@@ -264,12 +264,14 @@ class Simulator(Node):
             response.success, response.message = success, message
             future.set_result(response)
 
-        if not request.data:
-            self._recording.end(answer)
-        elif self.loop.state is LoopState.WAITING:
-            answer(False, self.loop.state.value)
-        else:
-            self._recording.start(self.values_next, answer)
+        try:
+            if request.data:
+                self.loop.refuse_in(LoopState.WAITING)
+                self._recording.start(self.values_next, answer)
+            else:
+                self._recording.end(answer)
+        except RuntimeError as error:       # also of a thread that cannot start
+            answer(False, str(error))
         return future
 
     def _publish_diagnostics(self) -> None:

@@ -71,9 +71,9 @@ class Recorder:
         self._wake, self._taken = threads.Event(), threads.Event()
         # A daemon, so that a disk that hangs cannot hold up the end of the interpreter; the exit
         # handler runs before daemons are stopped and closes the file properly.
-        atexit.register(self.close)
         self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
-        self._thread.start()
+        self._thread.start()            # or raise: then there is nothing to close
+        atexit.register(self.close)
 
     @property
     def room(self) -> bool:
