@@ -193,7 +193,7 @@ class Simulator(Node):
             self._topics.open(self.values_next)
             raise
         self.values_next = values
-        if others:
+        if others.keys() & {'tick_rate', 'time_scale'}:
             self._align_ticks()
 
     def _command(self, given: Mapping[str, Any]) -> None:
