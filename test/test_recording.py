@@ -19,6 +19,7 @@ from types import SimpleNamespace
 import pytest
 import yaml  # type: ignore[import-untyped]
 from helpers.logs import records_of, seen_by_mcap
+from helpers.machine import Machine
 from helpers.recordings import EPOCH_NS, JAZZY, METADATA, TOPICS, some_messages
 from helpers.reference import ROOT
 from mcap.opcode import Opcode
@@ -186,6 +187,19 @@ def test_too_little_space_leaves_no_file_and_holds_nobody_up(tmp_path, monkeypat
                         recorder.error)
     assert (recorder.path, recorder.missing, recorder.written) == (None, 1, (0, 0))
     assert recorder.room and not list(tmp_path.iterdir())
+
+
+def test_a_failure_ends_the_wait_for_room(tmp_path, monkeypatch):
+    def live():
+        recorder = Recorder(f'{tmp_path}/none/a.mcap', TOPICS, dict, threads=machine)
+        recorder.write([single(0, 1, b'')])
+        assert not recorder.room and recorder.wait_for_room(1000.0) and recorder.error
+        assert machine.clock() - began < 1.0
+
+    monkeypatch.setattr(recorder_module, 'QUEUE_BYTES', 1)
+    machine = Machine(random.Random(1))
+    began = machine.clock()
+    machine.run(live)
 
 
 @pytest.mark.parametrize(('harm', 'reason'), [

@@ -2,6 +2,10 @@
 """How a node in this process bears overload, stalled readers and full disks."""
 
 import errno
+import os
+import subprocess
+import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -70,6 +74,9 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
         assert not answer.success and 'exists' in answer.message
         assert not any(one.is_used for one in node.simulation.outputs)
         assert node.set(record__uri=f'{tmp_path}/new/er.mcap/').successful
+        with monkeypatch.context() as patch:
+            patch.setattr('threading.Thread.start', Mock(side_effect=RuntimeError('no thread')))
+            assert node.switch('record', True).message == 'no thread'
         answers = [node.switch('record', True).message for _ in range(2)]
         (path,) = (tmp_path / 'new/er.mcap').iterdir()
         assert answers == 2 * [f'recording to {path}']
@@ -82,3 +89,13 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
     errors = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
     assert ['not recording' in line for line in errors] == 3 * [True]
     assert precious.read_bytes() == b'precious'
+
+
+def test_a_reader_of_the_status_that_stalls_holds_nothing_up():
+    program = ('from spinning_top_sim.nodes.executable import tell\n'
+               'for _ in range(3000): tell(99 * "x")')
+    for reading, writing in (os.pipe(), os.openpty()):
+        subprocess.run([sys.executable, '-c', program], stdout=writing, timeout=60.0, check=True)
+        assert os.get_blocking(writing) and os.read(reading, 100).split() == [99 * b'x']
+        os.close(reading)
+        os.close(writing)

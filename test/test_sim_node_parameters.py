@@ -117,10 +117,12 @@ def test_a_stream_that_cannot_be_published_is_refused_before_anything_changes(tm
 
 def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
     """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""
+    timers = {*node.node.timers}
     assert node.set(solver__rtol='1e-9', imu__gyroscope_noise_density='5e-5', duration=0,
                     imu__lever_arm=['1e-2', '0e0', '2e0']).successful
     assert node.get('solver.rtol', 'imu.gyroscope_noise_density', 'duration') == [1e-9, 5e-5, 0.0]
     assert list(node.get('imu.lever_arm')[0]) == [0.01, 0.0, 2.0]
+    assert {*node.node.timers} == timers, 'ticks go on as before'
 
 
 def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node):

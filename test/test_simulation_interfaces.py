@@ -152,7 +152,11 @@ def test_a_failed_motion_is_paused_until_it_is_stopped_and_quitting_ends_the_nod
         OK, QUITTING, ALREADY)
     assert top.set_state('PLAYING') == INCORRECT_TRANSITION
     assert top.refused('ResetSimulation', scope=0)[0] == INCORRECT_STATE
-    assert top.trigger('reset').message == 'at the end: nothing follows'
+    for refused in (top.trigger('reset').message, top.switch('set_pause', False).message,
+                    top.set(step__dt=0.02, pose__enabled=False).reason,
+                    top.set(spin__l3=2.0).reason):
+        assert (refused, top.state) == ('at the end: nothing follows', QUITTING)
+    assert [one for one in top.node.publishers if one.topic_name == '/pose']
     top.spin_until('the end', top.node.finished.done)
     assert top.node.finished.result() is None       # exit code 0
 
@@ -228,7 +232,10 @@ def test_a_bad_state_changes_nothing(top):
 
 def test_before_the_clock_and_after_the_end_nothing_can_be_set(tmp_path):
     with StandardNode(tmp_path, use_sim_time=True) as top:
-        assert top.state == STOPPED and top.set_state('PLAYING') == TRANSITION_ERROR
+        top.loop.paused = False
+        for state in ('PLAYING', 'PAUSED'):
+            assert (top.set_state(state), top.state) == (TRANSITION_ERROR, STOPPED)
+        assert not top.loop.paused
         assert top.refused('StepSimulation', steps=1) == (
             INCORRECT_STATE, 'waiting for /clock (use_sim_time is set)')
     with StandardNode(tmp_path, duration=0.05) as top:

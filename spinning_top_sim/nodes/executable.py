@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -154,6 +155,8 @@ def _executor(node: Any) -> Executor:
 
 
 def tell(line: str) -> None:
-    """Print a line; a reader that has gone, or a full disk, does not end the node."""
-    with cli.reader_may_end(OSError):
-        print(line)
+    """Print a line without waiting; a reader that stalls or has gone, or a full disk, loses it."""
+    with contextlib.suppress(OSError):
+        os.set_blocking(1, False)       # only for this line: others may share the terminal
+        os.write(1, os.fsencode(f'{line}\n'))
+    os.set_blocking(1, True)

@@ -28,6 +28,9 @@ class LoopState(Enum):
     ENDED = 'at the end: nothing follows'
 
 
+STANDING = LoopState.WAITING, LoopState.FAILED, LoopState.ENDED     # no motion goes on there
+
+
 class Loop:
     """
     Moves a simulation along with a clock.
@@ -130,8 +133,8 @@ class Loop:
         self.paused = True
 
     def resume(self) -> None:
-        """Let simulated time run on, without catching up, or raise RuntimeError in FAILED."""
-        self._check_motion()
+        """Let simulated time run on, without catching up, or raise RuntimeError if it cannot."""
+        self.refuse_in(*STANDING)
         if self.paused:
             self.paused = False
             self._clock.run(self._simulation.now_ns)
@@ -139,7 +142,7 @@ class Loop:
 
     def step(self, length_ns: int) -> None:
         """Move a paused motion on, at most to `duration`, or raise RuntimeError."""
-        self._check_motion()
+        self.refuse_in(*STANDING)
         if not self.paused:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
@@ -148,8 +151,7 @@ class Loop:
         # Other than a tick it waits for the recorder.
         self._send(target_ns, 0, lambda: self._clock.steady() > stop_at_ns or (
             not self._recording.has_room(STEP_BUDGET_NS / NANOSECONDS)))
-        if self.failure:
-            raise RuntimeError(self.failure)
+        self.refuse_in(LoopState.FAILED)
         if (left_ns := target_ns - self._simulation.now_ns) > 0:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
                                f'{left_ns / NANOSECONDS:.9g} s are left')
@@ -160,27 +162,28 @@ class Loop:
 
         details : returns those of the event, of what is the present state then; None: no event
 
-        Raises ValueError for what cannot be, and RuntimeError in WAITING and FAILED.
+        Raises ValueError for what cannot be, and RuntimeError in STANDING.
         """
         if self._simulation.sent_ns < 0:        # the change sends the samples of t = 0
             self._update_subscribers()
         self._advance()
-        self._check_motion()
+        self.refuse_in(*STANDING)
         if found := details():
             self._recording.write(self._simulation.apply(kind, **found))
             self.commands += 1
 
     def set_parameters(self, values: Mapping[str, Any], changes: Mapping[str, Any]) -> None:
-        """Send what is due, then take over changes, of which all `values` are the result."""
+        """Send what is due, then take over changes into `values`; raise RuntimeError in ENDED."""
+        self.refuse_in(LoopState.ENDED)
         self._advance()     # by the old pace, and over a jump of /clock
         self._recording.write(self._simulation.apply('parameters', **changes))
         self._set_pace(values)
 
-    def _check_motion(self) -> None:
-        if self.state is LoopState.WAITING:
-            raise RuntimeError(self.state.value)
-        if self.failure:
-            raise RuntimeError(f'the motion stands still: {self.failure}')
+    def refuse_in(self, *states: LoopState) -> None:
+        """Raise RuntimeError in these states."""
+        if (state := self.state) in states:
+            raise RuntimeError(f'the motion stands still: {self.failure}'
+                               if state is LoopState.FAILED else state.value)
 
     def reset(self, values: Mapping[str, Any], paused: bool | None = None) -> None:
         """
@@ -189,8 +192,7 @@ class Loop:
         A pause remains, or is as `paused` says.  Raises RuntimeError in WAITING and ENDED, and
         ValueError if no motion begins there; the present one goes on then.
         """
-        if self.state in (LoopState.WAITING, LoopState.ENDED):
-            raise RuntimeError(self.state.value)
+        self.refuse_in(LoopState.WAITING, LoopState.ENDED)
         simulation = self._simulation
         last_stamp_ns = simulation.epoch_ns + simulation.sent_ns
         event = simulation.apply('reset', parameters=values,

@@ -183,18 +183,17 @@ class Simulator(Node):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
         try:                # what may be refused comes first
-            if others:
-                self._topics.open(values)
+            self._topics.open(values)
             if command:
                 self._command(command)
+            if others:
+                self.loop.set_parameters(values, {name: values[name] for name in sorted(
+                    others.keys() - SPIN)})
         except Exception:
             self._topics.open(self.values_next)
             raise
-        if others:
-            self.loop.set_parameters(values, {name: values[name] for name in sorted(
-                others.keys() - SPIN)})
         self.values_next = values
-        if others:
+        if others.keys() & {'tick_rate', 'time_scale'}:
             self._align_ticks()
 
     def _command(self, given: Mapping[str, Any]) -> None:
@@ -265,12 +264,14 @@ class Simulator(Node):
             response.success, response.message = success, message
             future.set_result(response)
 
-        if not request.data:
-            self._recording.end(answer)
-        elif self.loop.state is LoopState.WAITING:
-            answer(False, self.loop.state.value)
-        else:
-            self._recording.start(self.values_next, answer)
+        try:
+            if request.data:
+                self.loop.refuse_in(LoopState.WAITING)
+                self._recording.start(self.values_next, answer)
+            else:
+                self._recording.end(answer)
+        except RuntimeError as error:       # also of a thread that cannot start
+            answer(False, str(error))
         return future
 
     def _publish_diagnostics(self) -> None:

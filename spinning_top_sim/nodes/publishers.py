@@ -76,15 +76,12 @@ class ChannelPublishers:
 
     def update_subscribers(self) -> None:
         """Connect the outputs that have subscribers."""
-        changed = False
         for output in self._simulation.outputs:
             publisher = self.by_topic.get(output.channel.topic)
             wanted = publisher is not None and publisher.get_subscription_count() > 0
             if wanted != (output.publish is not None):
                 output.publish = publisher.publish if wanted and publisher else None
-                changed = True
-        if changed:
-            self._simulation.refresh()
+                self._simulation.refresh()
 
     def topics_to_record(self, channels: Sequence[Channel]) -> list[Topic]:
         """Return name, type and QoS of the topics of these channels, then those of events."""

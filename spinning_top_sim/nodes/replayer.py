@@ -167,8 +167,7 @@ class Replayer(Node):
 
     def _play(self) -> Iterator[float]:
         """Play the log; yield how long to wait each time [ns]."""
-        rounds = itertools.count() if self._options.loop else range(1)
-        for _ in rounds:
+        for _ in itertools.count() if self._options.loop else range(1):
             self._set_log_time(self._begin_ns)
             self._publish_clock()       # before the messages, since it may go back
             yield ROUND_GAP_NS

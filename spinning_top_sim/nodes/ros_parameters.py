@@ -40,8 +40,7 @@ def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) 
         if name in parameters.BY_NAME:
             values[name] = value
         elif not name.startswith('qos_overrides.'):
-            node.get_logger().warning(
-                f'there is no parameter {name}: ignored{likely_name(name)}')
+            node.get_logger().warning(f'there is no parameter {name}: ignored{likely_name(name)}')
     values = parameters.checked(values)
     shown = {**values, 'spin.lz': parameters.start_state(values).lz}
     node.declare_parameters('', [

@@ -48,8 +48,7 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], Any]]:
         arguments = parser.parse_args(words)
         if arguments.namespace:
             for_ros += ['-r', f'__ns:=/{arguments.namespace.strip("/")}']
-        name = executable.node_name(for_ros)
-        given = scene_file.given(arguments, name)
+        given = scene_file.given(arguments, executable.node_name(for_ros))
         for_ros = [*(word for name, value in given.items() if parameters.is_of_ros(name)
                      for word in ('-p', f'{name}:={json.dumps(value)}')), *for_ros]
         argv = ['--ros-args', *for_ros]

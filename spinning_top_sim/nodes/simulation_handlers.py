@@ -134,6 +134,7 @@ class SimulationHandlers:
         changes[wanted]()
 
     def _pause(self) -> None:
+        self._loop.refuse_in(LoopState.WAITING)
         self._loop.pause()
         self._loop.step(0)          # the sample of t = 0 tells PAUSED from STOPPED
 

@@ -71,9 +71,9 @@ class Recorder:
         self._wake, self._taken = threads.Event(), threads.Event()
         # A daemon, so that a disk that hangs cannot hold up the end of the interpreter; the exit
         # handler runs before daemons are stopped and closes the file properly.
-        atexit.register(self.close)
         self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
-        self._thread.start()
+        self._thread.start()            # or raise: then there is nothing to close
+        atexit.register(self.close)
 
     @property
     def room(self) -> bool:
@@ -154,6 +154,7 @@ class Recorder:
             self.error = text_of(error) if self.path is None else (
                 f'recording to {self.path} stopped: {reason_of(error)}')
             self.state = 'failed'
+            self._taken.set()
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
                 if self._syncing is not None:

@@ -106,8 +106,7 @@ def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_na
                'duration': {'nanoseconds': end_ns - start_ns}, 'message_count': sum(counts)}
     return {'serialized_metadata': as_yaml({
         'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
-        'storage_identifier': 'mcap',
-        **numbers,
+        'storage_identifier': 'mcap', **numbers,
         'topics_with_message_count': [
             {'topic_metadata': {
                 'name': topic.name, 'type': topic.type_name,
