@@ -114,7 +114,7 @@ class _Ours(Runner):
 class _ExactGrid(Runner):
     def attitudes(self, ns):
         solution = ExactSolution(self.case.top, self.case.start)
-        return solution.states(range(0, int(ns[1]) * len(ns), int(ns[1])),
+        return solution.states(int(ns[1]) * np.arange(len(ns)),
                                NANOSECONDS).quaternion
 
 

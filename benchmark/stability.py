@@ -159,7 +159,7 @@ def follow(case: Case, name: str, setting: float) -> tuple[np.ndarray, ...]:
     ns = grid_ns(HOUR, HOUR_RATE)
     samples = peer(name).ready(case, setting).samples(ns)
     truth = case.exact.states(
-        range(0, int(ns[-1]) + 1, int(ns[1])), NANOSECONDS).quaternion
+        np.arange(0, int(ns[-1]) + 1, int(ns[1])), NANOSECONDS).quaternion
     energy, l3, lz = samples.invariants(case)
     scale = case.top.gravity_torque, case.start.l3, case.start.lz
     return (angles_between(samples.quaternion, truth),
