@@ -83,7 +83,7 @@ def convention(exam: Exam) -> Measured:
     found = conventions.best(exam.plain.estimates[rests], exam.run.truth[rests],
                              steady=not exam.heading)
     before, after = np.degrees((found.before, found.after)).tolist()
-    if after < max(EXPLAINED * before, CLEAN_DEG):
+    if after < max(GAIN_OFF * before, CLEAN_DEG):       # of an exact thing little is left
         exam.convention = found.convention
     name = exam.convention.name
     return Measured(before, f'read as {name}, the error at rest falls from {before:.3g} to '
