@@ -256,10 +256,8 @@ def lever_arm(exam: Exam) -> Measured:
     with_arm = exam.outcome('lever arm', replace(exam.run, accelerometer=force))
     # When it has come; the last differences are one-sided.
     rows = rows[len(rows) // 2:-2]
-    still = exam.plain.estimates[rows]
-    tilt = rms(errors_of(with_arm.estimates[rows], still).tilt)
-    east, north, up = Rotation.from_quat(exam.run.truth[rows]).apply(
-        with_arm.run.accelerometer[rows]).T
+    tilt = rms(errors_of(with_arm.estimates[rows], exam.plain.estimates[rows]).tilt)
+    east, north, up = Rotation.from_quat(exam.run.truth[rows]).apply(force[rows]).T
     felt = rms(np.arctan2(np.hypot(east, north), up))
     return Measured(tilt / felt, f'10 cm off the axis, the specific force is {degrees(felt)} off '
                     f'the vertical, and the attitude {degrees(tilt)}: motion is taken for gravity',

@@ -68,8 +68,7 @@ class Exam:
     def starts(self) -> list[Outcome]:
         """New filters at rest, until they are settled or the patience ends, as they are told."""
         for seconds in LEADS_S:
-            outcomes = self._feed([Motion(start).rest(seconds).run('start')
-                                   for start in STARTS])
+            outcomes = self._feed([Motion(start).rest(seconds).run('start') for start in STARTS])
             if all(measures.settled(one.estimates, STILL) for one in outcomes):
                 break
         return outcomes
@@ -132,11 +131,9 @@ class Exam:
     def biased(self) -> Outcome:
         """A bias in a rest, and in one in which its axes of the world have other signs."""
         def make() -> list[Run]:
-            # Slowly, for fields that are read late; first about the vertical, because near the
-            # identity an integral in axes of the world is right.
-            motion = Motion(STARTS[0]).turn((-0.105, -0.087, 1.995), 0.5).rest(BIAS_S).turn(
-                (0.0, 1.4, 0.0), 0.5).rest(BIAS_S)
-            run = motion.run('bias')
+            # Slowly, for fields read late; first to where axes of sensor and world differ.
+            run = Motion(STARTS[0]).turn((-0.105, -0.087, 1.995), 0.5).rest(BIAS_S).turn(
+                (0.0, 1.4, 0.0), 0.5).rest(BIAS_S).run('bias')
             return [replace(run, gyroscope=run.gyroscope + BIAS)]
         return self.outcomes('bias', make)[0]
 
