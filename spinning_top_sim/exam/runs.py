@@ -68,8 +68,7 @@ class Exam:
     def starts(self) -> list[Outcome]:
         """New filters at rest, until they are settled or the patience ends, as they are told."""
         for seconds in LEADS_S:
-            outcomes = self._feed([Motion(start).rest(seconds).run('start')
-                                   for start in STARTS])
+            outcomes = self._feed([Motion(start).rest(seconds).run('start') for start in STARTS])
             if all(measures.settled(one.estimates, STILL) for one in outcomes):
                 break
         return outcomes
@@ -132,9 +131,9 @@ class Exam:
     def biased(self) -> Outcome:
         """A bias in a rest, and in one in which its axes of the world have other signs."""
         def make() -> list[Run]:
-            # Slowly, so that a bias feels little of a field that is read late.
-            motion = Motion(STARTS[0]).rest(BIAS_S).turn((0.0, 1.4, 0.0), 0.5).rest(BIAS_S)
-            run = motion.run('bias')
+            # Slowly, for fields read late; first to where axes of sensor and world differ.
+            run = Motion(STARTS[0]).turn((-0.105, -0.087, 1.995), 0.5).rest(BIAS_S).turn(
+                (0.0, 1.4, 0.0), 0.5).rest(BIAS_S).run('bias')
             return [replace(run, gyroscope=run.gyroscope + BIAS)]
         return self.outcomes('bias', make)[0]
 
