@@ -70,12 +70,12 @@ def run_node(name: str, argv: Sequence[str] | None,
         return _cannot_start(name, error) if rclpy.ok() else cli.OK
     finally:
         signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
-        _handle(signal.SIG_IGN, *signals)
+        _handle(lambda *_: None, *signals)      # if ignored, one that waits prints a traceback
         if node is not None:
             node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
-        _handle(signal.SIG_IGN, *signals)       # rclpy has restored the handlers that it found
+        _handle(signal.SIG_IGN, *signals)       # the end of Python restores the handlers
 
 
 def guard_clock(node: Node) -> None:
