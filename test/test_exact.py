@@ -24,9 +24,10 @@ from helpers.tops import EXACT, check_motion, time_limit
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers import solve as solve_module
-from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution
+from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution, exact_about
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.solve import motion_of
+from spinning_top_sim.solvers.vertical import Posture
 
 
 def error(value, digits, start=0.0):
@@ -148,3 +149,13 @@ def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():
     assert doctest.testmod(solve_module) == (0, 4)
     with pytest.raises(TypeError, match=r'^solve\(State, Top, ...\): must be solve\(top'):
         solve(*LOOPING[::-1], [0.0])
+
+
+@pytest.mark.parametrize('alpha', [0.0, 1.0])
+@pytest.mark.parametrize('transverse', [4.0, -4.0 + 1.0j])
+def test_a_motion_that_is_handed_over_at_a_pole_leaves_it_as_steps_do(alpha, transverse):
+    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.8)
+    posture, t = Posture(alpha + 0j, 1.0 - alpha + 0j, transverse + 0j, 0.8), np.arange(21) * 0.1
+    found, stepped = (motion.states(t).quaternion for motion in (
+        exact_about(top, posture, (0, 0, 0))[0], motion_of(top, posture, method='rk45')))
+    assert np.abs(found * np.sign(found[0] @ stepped[0]) - stepped).max() < 1e-9

@@ -23,6 +23,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.trajectory import Trajectory
+from spinning_top_sim.times import LAST_STAMP_NS
 
 PERIOD_NS = 10 * MILLISECOND        # of most topics
 
@@ -93,6 +94,15 @@ def test_a_long_integration_is_divided_and_leaves_a_state_to_read(monkeypatch):
     while behind.trajectory.steps < 4000:
         behind.send(10 ** 6 * SECOND, give_way=lambda: True)
         assert behind.state().theta[0] > 0.5
+
+
+def test_what_has_a_stamp_of_ros_is_sent_and_nothing_behind_it():
+    run = LiveSimulation(parameters.checked({}), LAST_STAMP_NS - 25 * MILLISECOND)
+    taken = record(run, 'pose')
+    with pytest.raises(dormand_prince.IntegrationError, match='January 2038'):
+        run.send(SECOND)
+    assert [LAST_STAMP_NS - stamp_ns for _, stamp_ns, _ in taken] == [
+        25 * MILLISECOND, 15 * MILLISECOND, 5 * MILLISECOND]
 
 
 def test_where_every_call_takes_long_time_goes_on():
