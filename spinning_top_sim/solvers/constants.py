@@ -114,6 +114,7 @@ class ThetaMotion(NamedTuple):
         alpha2, beta2 = abs(alpha) ** 2, abs(beta) ** 2
         d2, product = alpha2 + beta2, alpha * beta.conjugate()
         # -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); 0 where the axis rests at a pole
+        # (`abs`, as a zero mpc is true)
         u_dot = self.turning[whole % 2].u_dot * self.theta1.at(twice) / d2
         momentum = self.alpha.pole_rate * beta2 + self.beta.pole_rate * alpha2
         transverse = -(momentum + 0.5j * u_dot) / product if abs(product) else mpc(0)
@@ -128,7 +129,7 @@ def set_up(top: Top, start: State | Posture, gravity: mpfr | None = None) -> The
 
     Raises ValueError if none of BITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
-    algebraic, and no double but 0 has an algebraic cosine.  And if doubles cannot hold one.
+    algebraic, and no double but 0 has an algebraic cosine.  And if alpha or beta is too small.
     """
     for tried in BITS_TO_TRY:
         with theta.precision(tried), suppress(theta.DigitsLostError):

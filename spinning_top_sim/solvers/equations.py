@@ -165,8 +165,7 @@ class TransportMotion(SteppedMotion):
         self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
         self._phases_at_start = (0.5 * start.phi + 0.5 * start.psi,
                                  0.5 * start.phi - 0.5 * start.psi)
-        # Phases of alpha and beta, less their uniform parts, and theta/2 at the begins of the
-        # steps that are kept [rad].
+        # Phases of alpha and beta, less their uniform parts, and theta/2, at `_ends` [rad].
         self._phases_at_steps = [(*self._phases_at_start, half)]
         super().__init__(
             top, start, self.corrected((), (alpha, beta, m)), self._tolerance,
@@ -255,7 +254,7 @@ class TransportMotion(SteppedMotion):
         return [*phases, np.arctan2(moduli[1], moduli[0])]
 
     def _unwrap(self) -> None:
-        """Follow the phases to the begins of all steps that are kept."""
+        """Follow the phases to the last of `_ends`."""
         known = len(self._phases_at_steps)
         if known < len(self._ends):
             t, y = np.array(self._ends[known:]), tuple(components(self._y[known:]))
@@ -272,7 +271,7 @@ class TransportMotion(SteppedMotion):
         del self._phases_at_steps[:count]
 
     def _unknowns(self, t: Column) -> UnknownRows:
-        """Return the unknowns, and `_phases_at_steps` of the step that each time [s] lies in."""
+        """Return the unknowns, and `_phases_at_steps` where the step of each time [s] begins."""
         self._unwrap()
         first, steps, unknowns = self._interpolated(t)
         phases = np.array(self._phases_at_steps[first:first + steps.max(initial=0) + 1])

@@ -38,7 +38,7 @@ class ExactSolution(Motion):
 
     Parameters
     ----------
-    top, start : Top, State
+    top, start : Top, State or Posture
         The top, and its state at t = 0; of a `ContinuedState` theta may be any number.
     gravity : mpfr, optional
         In place of that of the top, for a motion about another vertical [m/s^2].

@@ -99,7 +99,7 @@ class Piece:
 
     @cached_property
     def exact(self) -> Piece | None:
-        """The same piece by the closed form; None where doubles cannot hold that."""
+        """This by the closed form, perhaps of an older ride; None where doubles cannot hold it."""
         if self.motion.is_exact:
             return self
         with suppress(ImportError, ValueError):
