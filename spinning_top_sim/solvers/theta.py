@@ -222,11 +222,11 @@ class ThetaForm:
         self.x_rate = self.y_rate * (self.stretch or ONE)
         q = exp(-const_pi() * (self.stretch or real_mean / imaginary_mean))
         self._a, self._c_squares = a, [c * c]
+        self._mean = imaginary_mean if imaginary else real_mean
         while len(self._c_squares) == 1 or c > a * NEGLIGIBLE:
             a, g = (a + g) / 2, sqrt(a * g)
             c = self._c_squares[-1] / (4 * a)       # [DLMF 19.8.3]
             self._c_squares.append(c * c)
-        self._mean = a
         self._make_series(q)
         # chi is (2K/pi) y
         rise = roots.gap21 * (self._a / (self._mean * self.slope1)) ** 2
