@@ -74,7 +74,7 @@ def _nodes(context: LaunchContext) -> list:
     namespace = given['namespace'].strip('/')
     files = [_scene_file(given['scene']), *filter(None, [given['params_file']])]
     asked = dict(map(parse_assignment, shlex.split(given['set'])))
-    of_ros = {name: asked.pop(name) for name in list(asked) if parameters.is_of_ros(name)}
+    of_ros = {name: value for name, value in asked.items() if parameters.is_of_ros(name)}
     if 'use_sim_time' in of_ros:
         raise ValueError(f'set = {given["set"]!r}: use_sim_time is an argument of its own, '
                          'use_sim_time:=true')

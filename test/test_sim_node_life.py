@@ -91,6 +91,13 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
     assert precious.read_bytes() == b'precious'
 
 
+def test_who_ends_the_recording_behind_the_end_still_gets_an_answer(tmp_path):
+    with OwnNode(tmp_path, duration=0.05, record__enabled=True) as node:
+        node.spin_until('the end', lambda: node.loop.state is loop.LoopState.ENDED)
+        answer = node.switch('record', False)
+    assert answer.success and f'{tmp_path}/run.mcap: ' in answer.message
+
+
 def test_a_reader_of_the_status_that_stalls_holds_nothing_up():
     program = ('from spinning_top_sim.nodes.executable import tell\n'
                'for _ in range(3000): tell(99 * "x")')

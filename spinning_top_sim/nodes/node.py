@@ -117,9 +117,9 @@ class Simulator(Node):
             self._log.error(f'not recording: {reason}; the simulation goes on')
         if state is LoopState.WAITING:
             self._begin()
-        elif state is LoopState.ENDED:
+        elif state is LoopState.ENDED and 'end' not in self._timer_of:     # ticks go on
             publishers.wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self._every('tick', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
+            self._every('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
 
     def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
         """Call back in steady time, each `period` [s], instead of what this timer did before."""

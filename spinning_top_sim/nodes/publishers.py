@@ -71,8 +71,8 @@ class ChannelPublishers:
                     self._node, message_class(output.channel.type_name), topic)
             elif topic in self.by_topic and not enabled:
                 output.publish = None
+                self._simulation.refresh()
                 self._node.destroy_publisher(self.by_topic.pop(topic))
-        self._simulation.refresh()
 
     def update_subscribers(self) -> None:
         """Connect the outputs that have subscribers."""

@@ -56,15 +56,14 @@ def run(name: str, help_text: str | None,
 
 
 @contextlib.contextmanager
-def reader_may_end(ignored: type[OSError] = BrokenPipeError,
-                   file: TextIO | None = None) -> Iterator[None]:
+def reader_may_end(file: TextIO | None = None) -> Iterator[None]:
     """Ignore, around printing, that the reader of a stream, such as a pager, ends before it."""
     stream = file or sys.stdout
     try:
         yield
         if stream:              # None where the shell has closed it
             stream.flush()
-    except ignored:         # Python flushes the output again
+    except BrokenPipeError:     # Python flushes the output again
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -94,7 +93,7 @@ def one_line(value: object) -> str:
 
 def print_line(text: str, file: TextIO | None = None) -> None:
     """Print a line, by default to the standard output; names in it cannot act on a terminal."""
-    with reader_may_end(file=file):
+    with reader_may_end(file):
         print(printable(text), file=file or sys.stdout)
 
 
