@@ -43,12 +43,12 @@ def test_a_constant_heading_is_no_error_where_it_need_only_be_steady():
 
 def test_a_report_is_a_table_and_json():
     report = Report('it', [Finding('timing', '3 samples late', 3.0)], {
-        'lag': Mark(3.0, 1.0, 'samples'), 'unknown': Mark(math.nan), 'far': Mark(math.inf)},
-        ['bias: not judged'])
+        'lag': Mark(3.0, 1.0, 'samples'), 'unknown': Mark(math.nan), 'far': Mark(math.inf),
+        'error: spin: fast': Mark(2.0)}, ['bias: not judged'])
     assert not report.passed and report.faults == ['timing'] and report.measures['lag'] == 3.0
     assert 'it: timing\n  timing: 3 samples late\n  bias: not judged\n' in str(report)
     assert any(line.split() == ['lag', '3', '1', 'samples'] for line in str(report).splitlines())
-    assert 'unknown' not in str(report)
+    assert 'unknown' not in str(report) and '  spin: fast      2' in str(report)
     said = json.loads(report.as_json())
     assert said['found'] == [{'name': 'timing', 'evidence': '3 samples late', 'number': 3.0}]
     assert said['marks']['far'] == {'value': None, 'limit': None, 'meaning': ''}

@@ -218,6 +218,8 @@ def test_a_log_of_this_package_is_graded_against_its_own_exact_motion(
     assert 'read up to the first event, at 4.000000000 s' in said['notes']
     assert main([path, '--topic', '/imu/data_raw']) == 1
     assert '  bias: gyroscope' in capsys.readouterr().out
+    assert main([path, '-p', 'top.mass:=2.1']) == 1
+    assert '  inaccurate: the attitude is up to' in capsys.readouterr().out
     monkeypatch.setattr('spinning_top_sim.grade.command.TOLERANCE', -1.0)
     assert main([path, '-p', 'imu.rpy:=[0.0, 0.0, 0.0]']) == 1
     out = capsys.readouterr().out

@@ -122,5 +122,5 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
         return ours
     after = [left(one, enough) for one in others]
     # Of equally good ones the first has the fewest parts.
-    best = int(np.argmax(np.array(after) <= 1.5 * min(after) + 1e-6))
+    best = int(np.argmax(np.array(after) <= conventions.AS_GOOD * min(after) + 1e-6))
     return others[best] if after[best] < enough else ours

@@ -158,8 +158,8 @@ class Comparison:
         sure = now - rest > unlike
         if np.any(likely > 1.0 + 2.0 * SURE * sigma) or not (sure or abs(late) < 2.0 * sigma):
             return math.nan, math.inf, False    # others, or none, explain it as well
-        noise = count * (self.model(0).fit([]).noise * size) ** 2
-        return late, sigma, sure and rest < max(0.25 * now, 1.5 * noise)
+        return late, sigma, sure and (
+            rest < 0.25 * now or rest < 1.5 * count * (self.model(0).fit([]).noise * size) ** 2)
 
     def model(self, lag: int) -> Model:
         """Return what readings that are `lag` samples late may contain beside what is right."""

@@ -89,7 +89,7 @@ def _of_motion(recorded: Recorded, values: Mapping[str, Any], run: Any) -> Repor
     if not body or body.coarse or tolerance > MOST:
         return Report('', unjudged=['the motion: too few poses, or too much noise'])
     if run:                             # its own exact motion, its moving pivot included
-        motion = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory
+        motion = Simulation({**values, 'solver.method': 'exact'}).trajectory
         stamps = np.rint(1e9 * body.t).astype(np.int64) + (recorded.origin - run.epoch_ns)
         truth = Rotation.from_quat(motion.evaluate(stamps).quaternion)
         worst = math.degrees(np.max((truth.inv() * body.rotation).magnitude()))

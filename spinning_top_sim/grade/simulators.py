@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.bodies import held, undone
-from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, judge, listed
+from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, UNEXPLAINED, judge, listed
 from spinning_top_sim.grade.columns import AXES, KINDS, NORM, READINGS, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.states import relative_drift
@@ -32,7 +32,6 @@ SAME = 0.1              # share of an error that another time leaves
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
-EXPLAINED = 0.25    # of the discrepancy is left at most
 SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
@@ -156,13 +155,13 @@ class Judgement:
         """Yield what is wrong with the motions and with each reading."""
         if not self.motions:
             return
-        of_rates = self._readings('rates').found
-        scaled = [one.name for one in of_rates] == ['rates_scale'] and max(
+        of_rates = self._readings('rates')
+        scaled = [one.name for one in of_rates.found] == ['rates_scale'] and max(
             motion.worst for motion in self.motions) > self.tolerance
-        if not of_rates or scaled:              # rates that are told are known
+        if scaled or not (of_rates.found or of_rates.unjudged):     # what is told is known
             for motion in self.motions:
                 motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
-        yield Report('', of_rates)
+        yield Report('', of_rates.found, unjudged=of_rates.unjudged)
         yield Report('', [one for one in self._of_motions() if not (
             scaled and one.name == 'inaccurate')])
         yield from map(self._marks, self.motions)
@@ -207,7 +206,7 @@ def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
         Cause(['damping', 'axis damping'], _damping),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
-    return found if rest.rest < EXPLAINED * model.size(TARGET) else []
+    return found if rest.rest < UNEXPLAINED * model.size(TARGET) else []
 
 
 def _terms(body: Body, motion: Stretch) -> dict[str, Reals]:

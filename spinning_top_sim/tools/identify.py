@@ -149,7 +149,7 @@ def explain(model: Model, causes: Sequence[Cause],
     chosen, others, nothing = list[Cause](), [*causes], fit_of([])
     fit = nothing
     enough = max(ENOUGH * fit.beyond, ENOUGH_OF_NOISE * fit.noise, least)
-    while len(chosen) < MOST_CAUSES and fit.beyond > enough:
+    while others and len(chosen) < MOST_CAUSES and fit.beyond > enough:
         tried = [fit_of([*chosen, cause]) for cause in others]
         after = [np.inf if judged([*chosen, cause], one)[-1] is None else one.beyond
                  for cause, one in zip(others, tried, strict=True)]

@@ -120,7 +120,7 @@ class Report:
         Those that are called 'MARK: SCENE' are a table of their own, scene by mark.
         """
         known = {name: mark for name, mark in self.marks.items() if not math.isnan(mark.value)}
-        of_scenes = {tuple(name.split(': ')): mark for name, mark in known.items() if ': ' in name}
+        of_scenes = {tuple(name.split(': ', 1)): known[name] for name in known if ': ' in name}
         limits = {what: _number(mark.limit) for (what, _), mark in of_scenes.items()}
         if of_scenes:
             rows = [(scene, *(_number(of_scenes.get((what, scene), NO_MARK).value)
