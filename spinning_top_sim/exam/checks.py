@@ -12,13 +12,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import NEES_OFF, USELESS_DEG, degrees
 from spinning_top_sim.exam.motions import FIELD, RATE, STEPS, Reals
-from spinning_top_sim.exam.runs import ANSWER, BACK, BIAS, BIAS_S, LARGE, SMALL, STILL, Exam
+from spinning_top_sim.exam.runs import ANSWER, BACK, BIAS, LARGE, SMALL, STILL, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Errors, errors_of
 from spinning_top_sim.tools.identify import AXES, rms
@@ -26,7 +27,7 @@ from spinning_top_sim.tools.report import Mark
 
 # Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
-MOVING_DEG = 0.5        # nor in motion, but for means of two samples where a turn begins
+MOVING_DEG = 0.5        # in motion: a mean of two samples is wrong where a turn begins
 GAIN_OFF = 0.02         # of what should be 1: less than sensors differ in scale
 EXPLAINED = 0.25        # of an effect: what its cause may leave of it
 DELAY = 0.25            # samples: half of what a mean of two steps is late
@@ -36,7 +37,7 @@ IGNORES = 0.9
 # Of large turns: half of what a step of first order, 2 atan(x / 2), misses.
 TURNS_OFF = LARGE ** 2 / 24.0
 GROWS = 2.0 + GAIN_OFF  # an error that grows slower and slower at most doubles in the second half
-# Steps by which filters may read force and field late: those that take a mean, or correct first.
+# Steps by which filters may read force and field late, or early: a mean of two is half a step.
 SHIFTS = 0.0, 0.5, 1.0, -1.0, -0.5
 BIAS_OFF = 0.3          # of a bias: integrals that leak keep as much
 ARM = 0.1, 0.0, 0.0     # of the IMU off the axis [m]
@@ -83,7 +84,7 @@ def convention(exam: Exam) -> Measured:
     found = conventions.best(exam.plain.estimates[rests], exam.run.truth[rests],
                              steady=not exam.heading)
     before, after = np.degrees((found.before, found.after)).tolist()
-    if after < max(GAIN_OFF * before, CLEAN_DEG):       # of an exact thing little is left
+    if after < max(GAIN_OFF * before, CLEAN_DEG):       # the right one leaves little
         exam.convention = found.convention
     name = exam.convention.name
     return Measured(before, f'read as {name}, the error at rest falls from {before:.3g} to '
@@ -172,7 +173,7 @@ def tilt_answer(exam: Exam) -> Measured:
                 rows[:1], SMALL * kick[np.newaxis]).part(slice(exam.ends[k])))
             first, later = np.cross(measures.up(moved.estimates[rows]),
                                     measures.up(exam.still.estimates[rows]))
-            # A filter may miss the kick.
+            # `first` is 0 if the filter misses the kick.
             back.append(1.0 - float(first @ later) / max(float(first @ first), STILL ** 2))
     share = np.array(back[::2]) / np.maximum(back[1::2], measures.ROUNDING)
     return Measured(1.0 - float(np.min(share)), 'gravity leads a tilt about x, y and z back by '
@@ -198,11 +199,11 @@ def clean(exam: Exam) -> Measured:
 
 
 def reported_bias(exam: Exam) -> Measured | None:
-    """Judge the bias that is reported, unless it comes closer half as fast as a while before."""
+    """Judge the reported bias, but not where its error still falls half as fast as before."""
     outcome, off, said = exam.biased, [], []
     for axes, rows in _of_bias(outcome):
         told = outcome.biases[rows][np.isfinite(outcome.biases[rows][:, 0])]
-        if len(told) < 4:           # of a filter that does not always know it
+        if len(told) < 4:           # too few: the filter hardly ever reports it
             return None
         said += [told[0], told[-1]]
         quarters = np.abs(told[np.linspace(0, len(told) - 1, 5, dtype=int)] / BIAS - 1.0)
@@ -248,8 +249,8 @@ def heading_answer(exam: Exam) -> Measured | None:
 
 def lever_arm(exam: Exam) -> Measured:
     """Move the IMU off the axis: the tilt must not follow the specific force."""
-    rows, force = np.flatnonzero(np.array(exam.motion.kinds) == 'top'), (
-        exam.run.accelerometer.copy())
+    rows = np.flatnonzero(np.array(exam.motion.kinds) == 'top')
+    force = exam.run.accelerometer.copy()
     turns = Rotation.from_quat(exam.run.truth[rows])
     velocity = np.gradient(turns.apply(ARM), 1.0 / RATE, axis=0)
     force[rows] += turns.inv().apply(np.gradient(velocity, 1.0 / RATE, axis=0))
@@ -276,7 +277,7 @@ def noisy(exam: Exam) -> Measured:
 
 
 def covariance(exam: Exam) -> Measured | None:
-    """Compare the squared error with the covariance; known noise leaves half of the doubt."""
+    """Compare the squared error with the covariance; the noise is known: half of NEES_OFF."""
     ratio = measures.nees_of(_late(exam))
     if ratio is None:
         return None
@@ -301,10 +302,10 @@ def _at_rest(outcomes: Sequence[Outcome], axes: slice) -> float:
         one.run.truth[-1], one.estimates[-1])[axes])) for one in outcomes), default=0.0))
 
 
-def _of_bias(outcome: Outcome) -> list[tuple[list[int], slice]]:
-    """Return axes that are level in the rests with a bias, whose errors gravity shows."""
-    n, length = len(outcome.run.dt), round(BIAS_S * RATE)
-    return [([0, 1], slice(length)), ([1, 2], slice(n - length, n))]
+def _of_bias(outcome: Outcome) -> list[tuple[list[int], NDArray[np.intp]]]:
+    """Return the axes that are level in a rest, whose errors gravity shows, and its samples."""
+    rests = np.flatnonzero(np.all(np.isclose(outcome.run.gyroscope, BIAS, atol=1e-5), axis=1))
+    return list(zip(([0, 1], [1, 2]), np.split(rests, 2), strict=True))
 
 
 def _late(exam: Exam) -> list[Outcome]:

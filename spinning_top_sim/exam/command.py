@@ -107,13 +107,13 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
     if kind == 'log':
         from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
         return partial(examine_log, subject)
+    words = shlex.split(subject) if kind in ('node', 'command') else [subject]
+    if not words:
+        raise ValueError(f'--{kind} {subject!r}: must be a program and its arguments')
     if kind == 'node':
         with needed('the exam of a node', 'ros'):
             from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
         return partial(examine_node, subject)
-    words = shlex.split(subject) if kind == 'command' else []
-    if kind == 'command' and not words:
-        raise ValueError(f'--command {subject!r}: must be a program and its arguments')
     make_filter: Callable[[], Filter] = partial(Program, words)
     how, name = feed, subject
     if kind == 'filter' and subject in FILTERS:

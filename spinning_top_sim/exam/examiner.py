@@ -67,9 +67,14 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
     Raises
     ------
+    TypeError
+        If `make_filter` cannot be called, such as a filter itself.
     ValueError
         If the level, a parameter or a seed is not allowed, or there is no trial in the folder.
     """
+    if not callable(make_filter):
+        raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
+                        "filter, or one of exam.adapters.FILTERS, such as FILTERS['vqf']")
     if data is not None and (level, imu, seeds) != ('quick', None, None):
         raise ValueError('data cannot be given with level, imu or seeds')
     if level not in SEEDS:
@@ -143,7 +148,7 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], Scored]], kin
     """
     Return the report on a filter in runs, made one by one; names of marks begin with `kind`.
 
-    The whole error is judged where it counts, of a filter that does not use the field the tilt.
+    Only samples that count are judged: the whole error, or the tilt where the field is ignored.
     """
     outcomes, failed, whole = [], [], True
     for done, make_run in enumerate(runs):

@@ -71,8 +71,7 @@ def examine_log(path: str | Path, topic: str, truth: str = TRUTH) -> Report:
         return Report(subject, [Finding('invalid_output', 'the message of '
                                         f'{stamp_text(int(said.stamps_ns[wrong[0]]))} s: '
                                         f'{wrong[1]}')], notes=notes)
-    outcome, before = _beside(one_line(topic), said, true)
-    return replace(_judge(subject, outcome, before), notes=notes)
+    return replace(_judge(subject, *_beside(one_line(topic), said, true)), notes=notes)
 
 
 def _read(reader: LogReader, name: str) -> Stamped:
@@ -98,7 +97,7 @@ def _read(reader: LogReader, name: str) -> Stamped:
 
 
 def _beside(name: str, said: Stamped, true: Stamped) -> tuple[Outcome, Reals]:
-    """Return the estimates with the truth at their stamps, and the truth one step before."""
+    """Return the estimates with the truth at their stamps, and the truth a step before each."""
     # The period of the filter, which may be shorter than that of the truth.
     step_ns = float(np.median(np.diff(said.stamps_ns)))
     after = np.clip(np.searchsorted(true.stamps_ns, said.stamps_ns), 1, len(true.stamps_ns) - 1)

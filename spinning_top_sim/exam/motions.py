@@ -85,13 +85,10 @@ Scored = tuple[Run, NDArray[np.intp]]
 
 
 class Motion:
-    """
-    A motion that is put together from rests and turns, from an attitude [deg] on.
-
-    kinds : of its samples: 'start', 'rests', 'turns', 'fast turns', 'slow turns', 'top'
-    """
+    """A motion that is put together from rests and turns, from an attitude [deg] on."""
 
     def __init__(self, start: Sequence[float]) -> None:
+        # Of each sample: 'start', 'rests', 'turns', 'fast turns', 'slow turns' or 'top'.
         self._attitudes = [Rotation.from_euler('ZYX', [start], degrees=True)]
         self.kinds: list[str] = []
 

@@ -19,7 +19,7 @@ from spinning_top_sim.tools.report import Finding, Report
 EXCERPT_S, SAMPLES = 5.0, (1000, 3000)        # of a motion by which a convention is found
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
-HELD_RUNS, HELD_SHARE = 20, 0.95    # runs of equal readings that are a hold, and as long as usual
+HELD_RUNS, HELD_SHARE = 20, 0.95    # of a hold: runs of equal rows, share of equal length
 
 
 def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STANDARD_GRAVITY,
@@ -63,11 +63,11 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
 
 
 def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:
-    """Return which rows (n, k) are not those before, and the fault if each is told again."""
+    """Return which rows (n, k) differ from the one before, and a fault if all are repeated."""
     new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
     runs = np.diff(np.flatnonzero(new))
     usual = runs[np.abs(runs - np.median(runs)) <= 1.0] if len(runs) >= HELD_RUNS else runs[:0]
-    # Others are longer: the body rests.
+    # Longer runs are allowed: the body rests.
     count = float(np.mean(usual)) if len(usual) > HELD_SHARE * len(runs) else 1.0
     return new, [Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
                          'log, is slower than its stamps', count)] * (count >= 1.3)
@@ -80,7 +80,7 @@ def undone(body: Stretch, convention: Convention) -> Stretch:
 
 
 def _of_sensor(one: Convention) -> bool:
-    """Return whether a convention is, but for a turn about z of the world, axes of the sensor."""
+    """Return whether a convention has other axes of the sensor, or the world turned about z."""
     turn = Rotation.from_quat(one.world)
     return any(part.startswith('sensor') for part in one.parts) or bool(
         turn.magnitude() > 0.1 and turn.apply(UP)[2] > 0.9 and not one.conjugate)
@@ -103,7 +103,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
               if (compared := Comparison(name, [body], imu, gravity)).motions}
 
     def left(convention: Convention, most: float = math.inf, sign: float = 1.0) -> float:
-        """Return the largest share of a reading that is not right in any unit, or one > most."""
+        """Return the largest share of a reading that is left; more than `most` ends the search."""
         told, worst = undone(body, convention), 0.0
         for name, width in widths.items():
             if worst <= most:

@@ -185,7 +185,7 @@ class SteppedMotion(Motion):
         del self._ends[:count], self._y[:count], self._derivatives[:count]
 
     def _number(self, t: float) -> int:
-        """Return at which of the ends the step begins that a time [s] lies in, or comes after."""
+        """Return the number of the step in which a time [s] lies, or of the last one before it."""
         return bisect_left(self._ends, t, 1, len(self._ends) - 1) - 1
 
     def states(self, t: Column | Times, per_second: int = 1) -> States:

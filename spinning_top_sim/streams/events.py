@@ -20,7 +20,7 @@ TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/Stri
 COMMAND = messages.float64_multi_array(('l3', 'lz'))        # an applied one, as it is logged
 MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
 CHANGES = (*MOTIONS, 'parameters', 'epoch', 'reset')        # all but the start of a recording
-# What an event has besides its times, and how it is read; 'parameters' has those that change.
+# The details of each event and what reads them; 'parameters' has those that change.
 _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     'start': {},
     'command': {'l3': float, 'lz': float},

@@ -106,7 +106,7 @@ class Simulation:
         return event
 
     def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:
-        """Return the details of a drive to a velocity in the world [m/s]; None: it rests, too."""
+        """Return details of a drive to a velocity in the world [m/s]; None: it stays at rest."""
         x, y, z = target = [float(part) for part in velocity]
         if not all(abs(part) <= parameters.FASTEST for part in target):
             raise ValueError(f'linear = {target!r} m/s: each must be finite and within '

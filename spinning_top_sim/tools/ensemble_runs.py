@@ -31,7 +31,7 @@ from spinning_top_sim.tools.scene_file import likely_name, parse_section, parse_
 # What a run has of its own: its number `run`, its `seed`, and the sampled parameters.
 Row = Mapping[str, Any]
 FAILED_KEY = b'failed'          # of the metadata of a file: runs that failed, and why
-# A part has so much simulated time [s] at most, or one run; a large ensemble has so many parts.
+# Simulated time [s] that a part of several runs has at most; parts that many runs have at least.
 PART_S, LEAST_PARTS = 250.0, 50
 # Streams that a table can have; only a log has the others.
 STREAMS = tuple(name for name in parameters.STREAMS if name not in ('clock', 'markers'))

@@ -36,7 +36,7 @@ from spinning_top_sim.tools.survey import Motion, Survey
 
 Reals = NDArray[np.float64]
 PLOTTED_S, ANIMATED_S = 20.0, 10.0      # that a picture shows at most
-# Topics, of which an export has the numbers.  TUM (vision.in.tum.de, RGB-D dataset, file formats)
+# Topics whose numbers are exported.  TUM (vision.in.tum.de, RGB-D dataset, file formats)
 # has "timestamp tx ty tz qx qy qz qw", in s and m; EuRoC (M. Burri et al., IJRR 35, 2016)
 # state_groundtruth_estimate0/data.csv and imu0/data.csv.
 IMU, BIAS, BODY = 'ground_truth/imu_odom', 'ground_truth/imu_bias', 'ground_truth/odom'

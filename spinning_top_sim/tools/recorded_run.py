@@ -178,7 +178,7 @@ class Comparison:
 
     def add(self, stamp_ns: int, topic: str, logged: bytes | None,
             computed: tuple[Template, bytes] | None) -> None:
-        """Add a message, which may be in one of both only."""
+        """Count a message of the log, of the run, or of both."""
         found = ''
         if logged is None:
             self.missing += 1
@@ -252,7 +252,7 @@ def _compute(run: RunDescription, waiting: Mapping[tuple[int, str], Any],
 
 
 def _difference(logged: bytes, template: Template, computed: bytes) -> str:
-    """Return what is the first that differs."""
+    """Return the first difference."""
     if len(logged) != len(computed):
         return f'{len(logged)} bytes in the log, {len(computed)} computed'
     at = next(at for at in range(len(logged)) if logged[at] != computed[at])
