@@ -164,3 +164,5 @@ def test_motions_are_forgotten_when_nothing_reaches_back_to_them():
         simulation.apply('command', l3=1.6 + 0.001 * tick, lz=1.4)
     kept = simulation.trajectory.starts(0, 7 * SECOND)
     assert 3 * SECOND // 2 <= kept[0] <= 2 * SECOND and kept[-1] == 6 * SECOND
+    with pytest.raises(LookupError, match=r't = 0 ns: the motion before .* is forgotten'):
+        simulation.trajectory.evaluate(np.array([0]))

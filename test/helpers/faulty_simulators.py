@@ -18,7 +18,7 @@ def exact(top, start, times, dt, **options):
 
 
 def cross(one, other):
-    (a, b, c), (x, y, z) = one, other
+    (a, b, c), (x, y, z) = one, other       # np.cross takes long for one
     return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
 
 
@@ -29,7 +29,7 @@ def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, worl
     com = np.array(top.com if com is None else com)
 
     def accelerations(q, w):
-        """Return those of states (4, n), (3, n), or of one; np.cross takes long for one."""
+        """Return those of states (4, n), (3, n), or of one."""
         x, y, z, s = q
         up = 2.0 * np.array((x * z - s * y, y * z + s * x, 0.5 - x * x - y * y))
         term = cross(w, (w.T * inertia).T)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from helpers.faulty_simulators import cross
 from helpers.reference import ROOT
 from spinning_top_sim.exam.adapters import Vqf
 from spinning_top_sim.exam.measures import from_two_vectors
@@ -77,9 +78,7 @@ class Mahony:
     def _turn(self, a, m, dt):
         up, north, learns = self._gains
         r = reference.matrix_of(self._q)
-        (x, y, z), (i, j, k) = a.tolist(), r[2].tolist()        # np.cross takes 50 times as long
-        e = up / math.hypot(x, y, z) * np.array((
-            y * k - z * j, z * i - x * k, x * j - y * i)) * self._feels
+        e = up / math.hypot(*a) * cross(a.tolist(), r[2].tolist()) * self._feels
         if m is not None:
             h = r @ m
             if not self._level:
