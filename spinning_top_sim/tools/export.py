@@ -27,11 +27,10 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, scene_file
 
 FORMATS = ('mjcf', 'urdf', 'sdf')
-FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')
 # Arguments of the xacro file and the parameters that they are taken from.
 ARGUMENTS = {name.removeprefix('top.').replace('.', '_'): name for name in (
     'top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'imu.lever_arm', 'imu.rpy',
-    *FRAMES)}
+    *parameters.FRAMES)}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +93,7 @@ def robot_description(values: Mapping[str, Any], folder: Path) -> str:
     body = values['body_frame']
     prefix = body[:body.rfind('/') + 1]         # a/base_link, a/nutation_link
     between = [f'{prefix}precession_link', f'{prefix}nutation_link']
-    for name in FRAMES:         # that these differ from each other is checked before
+    for name in parameters.FRAMES:  # that these differ from each other is checked before
         if values[name] in between:
             raise ValueError(f'{name} = {values[name]!r}: must not be one of {", ".join(between)}')
     given = {'prefix': prefix, **{name: values[key] for name, key in ARGUMENTS.items()}}

@@ -104,14 +104,14 @@ def _event_before(entry: Mapping[str, Any] | Sequence[Any]) -> Event:
 
 def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, str]:
     every = channels_of(values)
-    logged = [*((channel.topic, channel.type_name) for channel in recorded(every, values)),
-              *events.TOPICS.items()]
+    logged = {channel.topic: channel.type_name
+              for channel in recorded(every, values)} | events.TOPICS
     # As the log was written they have this order, whatever they were remapped to.  In a log that
     # was put together anew they are known by the ends of their names.
-    if [topic.type_name for topic in topics] == [type_name for _, type_name in logged]:
-        return {name: topic.name for topic, (name, _) in zip(topics, logged, strict=True)}
-    known = [*((channel.topic, channel.type_name) for channel in every), *events.TOPICS.items()]
-    return {name: topic.name for topic in reversed(topics) for name, type_name in known
+    if [topic.type_name for topic in topics] == [*logged.values()]:
+        return {name: topic.name for topic, name in zip(topics, logged, strict=True)}
+    known = {channel.topic: channel.type_name for channel in every} | events.TOPICS
+    return {name: topic.name for topic in reversed(topics) for name, type_name in known.items()
             if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
 
