@@ -49,11 +49,10 @@ def test_numbers_and_stamps_are_those_of_messages_to_the_last_bit(
 
 def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(tmp_path):
     """In the world the velocity is the rate of the position."""
-    log, path = log_of(
+    path, log = tmp_path / 'a', log_of(
         tmp_path / 'run.mcap', '--duration', 1, '-p', 'ground_truth_imu_odom.enabled:=true', '-p',
         'ground_truth_imu_odom.rate:=125.0', '-p', 'imu.lever_arm:=[0.1, -0.2, 0.3]', '-p',
-        'imu.gyroscope_random_walk:=1e-2', '-p', 'imu.accelerometer_turn_on_bias:=0.1',
-        ), tmp_path / 'a'
+        'imu.gyroscope_random_walk:=1e-2', '-p', 'imu.accelerometer_turn_on_bias:=0.1')
     assert inspect.main([str(log), '--export', f'euroc:{path}']) == 0
     found = {}
     with AnyReader([log]) as reader:

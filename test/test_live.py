@@ -106,7 +106,6 @@ def test_what_has_a_stamp_of_ros_is_sent_and_nothing_behind_it():
 
 
 def test_where_every_call_takes_long_time_goes_on():
-    """However little is computed at once costs the same: pieces are not halved for ever."""
     slow = LiveSimulation(parameters.checked({}), EPOCH_NS, itertools.count(0.0, 0.02).__next__)
     record(slow, 'pose')
     for _ in range(300):

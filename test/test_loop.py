@@ -22,7 +22,7 @@ class Run:
     told: warnings, errors and events
     """
 
-    def __init__(self, **values):
+    def __init__(self, follows=False, **values):
         self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
         self.counted = 0            # how often subscribers were
         self.simulation = simulate(**values)
@@ -31,7 +31,8 @@ class Run:
                                     write=self.told.append)
         self.loop = Loop(
             self.simulation, self.values, recording, SimulatedClock(
-                lambda: DATE_NS + self.now_ns - 77, self.told.append, steady=self.read),
+                lambda: DATE_NS + self.now_ns - 77, self.told.append, follows=follows,
+                steady=self.read),
             update_subscribers=self.count, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
@@ -112,6 +113,13 @@ def test_a_pause_holds_a_step_is_exact_and_nothing_is_caught_up(monkeypatch):
     assert run.simulation.now_ns == before + 50 * 3 * TICK_NS
     assert run.times == grid(run.simulation.now_ns)
     assert run.loop.late_ticks == run.loop.skipped_ticks == 0
+
+
+def test_a_change_of_parameters_does_not_hide_a_jump_of_the_clock():
+    run = Run(follows=True).ticks(4)
+    run.now_ns += 3600 * SECOND
+    run.loop.set_parameters(run.values, {'status_period': 0.5})
+    assert (run.ticks(2).kinds, run.simulation.now_ns) == (['epoch', 'parameters'], 6 * TICK_NS)
 
 
 def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahead_slips(

@@ -12,7 +12,7 @@ from helpers.node_logs import TRACEBACK, log_of, the_log
 from helpers.own_node import run_main
 from test_scene_file import scene
 
-from spinning_top_sim.nodes import replay_node, sim_node
+from spinning_top_sim.nodes import replay_node, sim_node, simulation_handlers
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import qos_profiles
 from spinning_top_sim.streams import parameters
@@ -147,3 +147,13 @@ def test_a_file_is_read_for_the_name_that_the_node_gets(tmp_path, start_values):
                         '/another: {ros__parameters: {seed: 5}}\n')
         topic, values = start_values('--scene', str(file), *arguments)
         assert (topic, values['seed']) == (f'{name}/events', 4)
+
+
+def test_simulation_interfaces_is_offered_where_it_is_installed_and_not_switched_off(
+        monkeypatch, start_values):
+    offered = []
+    monkeypatch.setattr(simulation_handlers, 'offer', offered.append)
+    for installed, wanted in ((True, True), (False, True), (True, False)):
+        monkeypatch.setattr(sim_node, 'find_spec', lambda name, there=installed: there or None)
+        start_values('--ros-args', '-p', f'simulation_interfaces:={str(wanted).lower()}')
+    assert len(offered) == 1

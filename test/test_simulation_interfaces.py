@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import Pose, Quaternion
+from geometry_msgs.msg import Pose, Quaternion, Twist, Vector3
 from helpers import standard_types
 from helpers.node_logs import events_in, log_of, verified, xyz, xyzw
 from helpers.own_node import OwnNode
@@ -228,6 +228,20 @@ def test_a_bad_state_changes_nothing(top):
         found, reason = top.refused('SetEntityState', **top.put(changes))
         assert (found, text in reason) == (code, True), (found, reason)
         assert (numbers(top.entity) == numbers(before)).all()
+
+
+def test_a_state_can_be_set_where_the_pivot_is(top):
+    """What the node says of a moving pivot can be sent back to it, and nothing else."""
+    top.pause()
+    top.receive('cmd_vel', Twist(linear=Vector3(x=0.5)))
+    top.done('StepSimulation', steps=30)
+    assert (state := top.entity).pose.position.x > 0.01 and state.twist.linear.x > 0.1
+    assert top.refused('SetEntityState', **top.put(set_twist=False))[0] == INVALID_POSE
+    top.done('SetEntityState', **top.put(state=state))
+    after = top.entity
+    assert xyz(after.pose.position) == xyz(state.pose.position)
+    assert xyz(after.twist.linear) == xyz(state.twist.linear)
+    assert numbers(after)[:7] == pytest.approx(numbers(state)[:7], abs=1e-12)
 
 
 def test_before_the_clock_and_after_the_end_nothing_can_be_set(tmp_path):
