@@ -231,11 +231,11 @@ def test_a_bad_state_changes_nothing(top):
 
 
 def test_a_state_can_be_set_where_the_pivot_is(top):
-    """What the node says of a moving pivot can be sent back to it, and nothing else."""
     top.pause()
     top.receive('cmd_vel', Twist(linear=Vector3(x=0.5)))
     top.done('StepSimulation', steps=30)
-    assert (state := top.entity).pose.position.x > 0.01 and state.twist.linear.x > 0.1
+    state = top.entity
+    assert state.pose.position.x > 0.01 and state.twist.linear.x > 0.1
     assert top.refused('SetEntityState', **top.put(set_twist=False))[0] == INVALID_POSE
     top.done('SetEntityState', **top.put(state=state))
     after = top.entity
