@@ -102,8 +102,8 @@ def test_arrows_are_the_vectors_in_the_world():
 
 def test_plots_are_the_numbers_of_the_motion(shown):
     t_ns, top = 2_500_000_000, shown.top
-    found = {(plot.title, line.name): (plot, line) for plot in plots.motion_plots(
-        shown, t_ns, 0, t_ns) for line in plot.lines}
+    found = {(plot.title, line.name): (plot, line) for plot in (plots.potential_plot(
+        shown, t_ns), *plots.time_plots(shown, t_ns, 0, t_ns)) for line in plot.lines}
     _, tilt = found['Tilt', 'θ']
     svg = ElementTree.fromstring(plots.draw(plots.Plot('Tilt', 't [s]', 'θ [deg]', [tilt], 2.5)))
     assert {'Tilt', 't [s]', 'θ [deg]', '0.0', '2.0', '30', '40'} <= {*svg.itertext()}
@@ -140,8 +140,8 @@ def test_every_scene_has_words_and_plots(name):
     motion, description = track.motion_at(0), track.trajectory.after(0).describe()
     assert motion.pivot_moves is (description is None)
     words = text.words(track, 0)
-    svg = [*filter(None, map(plots.draw, plots.motion_plots(
-        track, NANOSECONDS, 0, NANOSECONDS)))]
+    svg = [*filter(None, map(plots.draw, (plots.potential_plot(track, NANOSECONDS),
+                                          *plots.time_plots(track, 0, 0, NANOSECONDS))))]
     assert len(svg) == (4 if description else 3)
     assert 'nan' not in words + ''.join(svg)
     if description is None:
@@ -182,7 +182,7 @@ def test_every_motion_has_a_sentence():
      'initial.theta': 2.9, 'spin.l3': -0.05, 'spin.lz': 0.02}])
 def test_a_fast_motion_has_its_peaks_and_its_trace(changes):
     track, t_ns = simulation.SimulatedTrack(values_of('cusp', **changes)), 17_300_000_000
-    (line,) = plots.motion_plots(track, t_ns, t_ns - WINDOW_NS, t_ns)[-1].lines
+    (line,) = plots.time_plots(track, t_ns, t_ns - WINDOW_NS, t_ns)[-1].lines
     found = track.motion_at(t_ns).description
     nutations = np.array_split(line.y, int(np.ptp(line.x) / found.nutation_period))
     reach = found.precession_max - found.precession_min
@@ -191,7 +191,7 @@ def test_a_fast_motion_has_its_peaks_and_its_trace(changes):
         assert np.abs(np.subtract([*peaks], peak)).max() < 0.05 * reach
     assert len(nutations) >= 4 and len(line.y) <= POINTS + 2 and line.x[-1] == 17.3
     assert len(drawn.tip_path(track, t_ns)) == len(line.y) - 1
-    first, = plots.motion_plots(track, 0, 0, t_ns)[-1].lines
+    first, = plots.time_plots(track, 0, 0, t_ns)[-1].lines
     assert first.x[0] == 0.0 and len(first.y) <= POINTS + 2
 
 

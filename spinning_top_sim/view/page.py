@@ -112,8 +112,9 @@ class Page:
         """Draw a top at a time, now and then with its plots and words."""
         self.draw_scene(t_ns, track)
         if self._number % PLOT_EVERY == 0:
-            set_content(self._plots, ''.join(map(plots.draw, plots.motion_plots(
-                track, t_ns, t_ns - WINDOW_NS, t_ns))))
+            set_content(self._plots, ''.join(map(plots.draw, (
+                plots.potential_plot(track, t_ns),
+                *plots.time_plots(track, t_ns, t_ns - WINDOW_NS, t_ns)))))
             set_content(self._words, text.words(track, t_ns))
             set_content(self._legend, self.legend())
         self._number += 1

@@ -103,9 +103,12 @@ def write_file(path: Path, page: Page, player: Player, track: Track) -> str:
         page.draw_scene(t_ns, track)
 
     draw(begin_ns)
-    words = ''.join(text.words(track, t_ns) for t_ns in (begin_ns, *player.motions_ns)
-                    if t_ns <= end_ns)
-    drawn = ''.join(map(plots.draw, plots.motion_plots(track, begin_ns, begin_ns, end_ns)))
+    motions_ns = [t_ns for t_ns in (begin_ns, *player.motions_ns) if t_ns <= end_ns]
+    words = ''.join(text.words(track, t_ns) for t_ns in motions_ns)
+    drawn = ''.join(
+        f'<section class="potential" data-from="{t_ns / NANOSECONDS}">'
+        f'{plots.draw(plots.potential_plot(track, t_ns))}</section>' for t_ns in motions_ns)
+    drawn += ''.join(map(plots.draw, plots.time_plots(track, begin_ns, begin_ns, end_ns)))
     serializer = page.server.get_scene_serializer()
     for picture in range(1, int((end_ns - begin_ns) / NANOSECONDS * RATE) + 1):
         serializer.insert_sleep(1.0 / RATE)

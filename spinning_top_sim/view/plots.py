@@ -8,12 +8,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from spinning_top_sim.physics.top import Top
 from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view.source import Motion, Reals, Track, effective_potential
+from spinning_top_sim.view.source import Reals, Track, effective_potential
 
 BLUE, RED, GREEN = '#1c6dd0', '#d9482b', '#1e8a4c'
-FLAT = 1e-3                     # least range of an axis / the greatest value
+FLAT, ZERO = 1e-3, 1e-12        # least range of an axis / the greatest value; this and less is 0
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340, 172, 46, 332, 38, 140        # [px]
 
 
@@ -43,9 +42,29 @@ class Plot(NamedTuple):
     over: Literal['time', 'tilt'] = 'time'
 
 
-def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Plot]:
+def potential_plot(track: Track, t_ns: int) -> Plot:
+    """Return V around the bounds of theta, and the energy of the axis; no lines if not known."""
+    body, newest, motion = track.top, track.newest(t_ns), track.motion_at(t_ns)
+    plot = Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', [], math.nan, over='tilt')
+    if newest is None or motion is None or motion.description is None:
+        return plot
+    l3, lz = motion.l3, motion.lz
+    theta = np.linspace(1e-3, math.pi - 1e-3, 2000)
+    values = effective_potential(body, l3, lz, theta)
+    depth = max(motion.energy - float(values.min()), 0.05 * abs(body.gravity_torque),
+                1e-6 * abs(motion.energy))
+    shown = np.flatnonzero(values <= motion.energy + depth)
+    theta = np.linspace(theta[shown[0]], theta[shown[-1]], 200)
+    bounds = np.array([motion.description.theta_min, motion.description.theta_max])
+    return plot._replace(lines=[
+        Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta)),
+        Line('E − L₃²/2λ₃', GREEN, np.degrees(bounds), np.full(2, motion.energy))],
+        now=math.degrees(track.state(newest).theta_folded[0]), point=motion.energy)
+
+
+def time_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Plot]:
     """
-    Return the plots of potential, energies, tilt and precession, as far as there are data.
+    Return the plots of energies, tilt and precession, as far as there are data.
 
     t_ns : the time that is marked
     begin_ns, end_ns : span of the plots over the time; of a fast motion they show a part
@@ -55,11 +74,8 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
     # Without the motion of the pivot.
     kinetic = 0.5 * (top.lambda1 * (w1 * w1 + w2 * w2) + top.lambda3 * w3 * w3) + 0.0 * seconds
     height = top.gravity_torque * states.rows_axis[2]
-    newest, now, motion = track.newest(t_ns), t_ns / NANOSECONDS, track.motion_at(t_ns)
-    theta = math.nan if newest is None else math.degrees(track.state(newest).theta_folded[0])
+    now = t_ns / NANOSECONDS
     return [
-        Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', _potential(top, motion), theta,
-             motion.energy if motion and motion.description else math.nan, 'tilt'),
         Plot('Energy', label, 'E [J]', [
             Line('kinetic', RED, seconds, kinetic), Line('potential', BLUE, seconds, height),
             Line('sum', GREEN, seconds, kinetic + height)], now),
@@ -69,29 +85,14 @@ def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Pl
             Line('φ′', BLUE, seconds, states.phi_dot)], now)]
 
 
-def _potential(body: Top, motion: Motion | None) -> list[Line]:
-    """Return V around the bounds of theta, and the energy of the axis between them."""
-    if motion is None or motion.description is None:
-        return []
-    l3, lz = motion.l3, motion.lz
-    theta = np.linspace(1e-3, math.pi - 1e-3, 2000)
-    values = effective_potential(body, l3, lz, theta)
-    depth = max(motion.energy - float(values.min()), 0.05 * abs(body.gravity_torque),
-                1e-6 * abs(motion.energy))
-    shown = np.flatnonzero(values <= motion.energy + depth)
-    theta = np.linspace(theta[shown[0]], theta[shown[-1]], 200)
-    bounds = np.array([motion.description.theta_min, motion.description.theta_max])
-    return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta)),
-            Line('E − L₃²/2λ₃', GREEN, np.degrees(bounds), np.full(2, motion.energy))]
-
-
 class _Axis:
     """An axis from `low` to `high`, which are at two pixels."""
 
     def __init__(self, parts: Sequence[Reals], margin: float, first: int, last: int) -> None:
         values = np.concatenate(parts)
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        least = max(FLAT * max(abs(low), abs(high)), 1e-12)
+        size = max(abs(low), abs(high))
+        least = FLAT * size if size > ZERO else 1.0
         add = margin * (high - low) + (least if high - low < least else 0.0)
         self.low, self.high, self._first, self._last = low - add, high + add, first, last
 
@@ -131,8 +132,8 @@ def draw(plot: Plot) -> str:
         f'data-px="{LEFT} {RIGHT}"><text class="title" x="8" y="14">{plot.title}</text>'
         f'<text x="8" y="28">{plot.y_label}</text><text x="{(LEFT + RIGHT) / 2}" '
         f'y="{HEIGHT - 5}" text-anchor="middle">{plot.x_label}</text>'
-        f'<text x="{RIGHT}" y="28" text-anchor="end">', *(
-            f'<tspan fill="{colour}" dx="9">●</tspan><tspan dx="3">{html.escape(name)}</tspan>'
+        f'<text x="{RIGHT}" y="28" text-anchor="end">', '\u2003'.join(
+            f'<tspan fill="{colour}">●</tspan> {html.escape(name)}'
             for name, colour in names.items() if len(names) > 1), '</text>']
     for x, number in across.ticks():
         drawn.append(f'<path class="grid" d="M{x} {TOP}V{BOTTOM}"/>'

@@ -62,6 +62,8 @@ class SampledTrack(Track):
         self.stamps_ns, order = np.unique(np.concatenate((self.stamps_ns, stamps_ns)),
                                           return_index=True)
         self.rows = np.concatenate((self.rows, rows))[order]
+        if len(order) > 1:
+            self.least_step_ns = int(np.ptp(self.stamps_ns)) // (len(order) - 1)
 
     def add_messages(self, topic: str, messages: Sequence[bytes]) -> None:
         """Add messages of one of TOPICS, but those whose quaternion is no attitude."""

@@ -76,7 +76,10 @@ class Track(ABC):
     values : checked parameters of the run
     about : where it comes from, in a sentence; '' if the title of the page says it
     epoch_ns : stamp of t = 0 [ns]
+    least_step_ns : time between two samples, where they are given
     """
+
+    least_step_ns = 1
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.values, self.about, self.epoch_ns = values, '', epoch_ns
@@ -118,7 +121,8 @@ class Track(ABC):
         if found and found.nutation_period:
             most = math.tau / found.nutation_period * POINTS / (PER_TURN * NUTATIONS)
             rate = max(rate, min(most, max(found.precession_max, -found.precession_min)))
-        step_ns = max(1, min(longest_ns, int(math.tau / (PER_TURN * rate) * NANOSECONDS)))
+        step_ns = max(self.least_step_ns, min(
+            longest_ns, int(math.tau / (PER_TURN * rate) * NANOSECONDS)))
         end_ns = min(end_ns, max(t_ns, begin_ns + POINTS * step_ns))
         return self.at(self.times(max(begin_ns, end_ns - POINTS * step_ns), end_ns, step_ns))
 
