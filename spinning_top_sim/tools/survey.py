@@ -8,9 +8,11 @@ The public attributes of `Survey` and `Motion` are the keys of `inspect --json`,
 
 from __future__ import annotations
 
+import itertools
 import math
 from array import array
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +23,7 @@ from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
-from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.reader import BLOCK, LogMessage, LogReader
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times
@@ -108,20 +110,20 @@ class Motion:
         self.orientation_error: float | None = None
         self.states: SampledStates | None = None
 
-    def measure(self, reader: LogReader) -> None:
-        """Compare the samples in a log with the motion; `states` are all of them."""
-        if not (self._channel and self.source):
-            return
+    def measure(self, messages: Iterator[LogMessage], log_ns: int) -> None:
+        """Compare its samples with the motion; `states` are all of them, since a log time."""
+        assert self._channel is not None
         piece, template, parts = self._piece, self._channel.template, []
-        for _, group in reader.groups([self.source], self.begin_ns + 1, self.end_ns + 1):
-            fitting = [one for one in group if len(one.data) == len(template)]
+        while group := [*itertools.islice(messages, BLOCK)]:
+            fitting = [one for one in group if len(one.data) == len(template)
+                       and one.log_time > self.begin_ns]
             parts.append(attitudes_of(
                 self._channel.topic, self._imu, np.array([one.log_time for one in fitting]),
                 template.decode(b''.join(one.data for one in fitting))))
         if sum(len(stamps_ns) for stamps_ns, _ in parts) < 2:
             return
         stamps_ns, rows = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-        self.states = states = SampledStates(piece.top, 1e-9 * (stamps_ns - reader.span[0]), rows)
+        self.states = states = SampledStates(piece.top, 1e-9 * (stamps_ns - log_ns), rows)
         if piece.rests and not np.isnan(states.l3).all():   # else it has other constants
             self.drifts = {name: _largest(relative_drift(
                 getattr(states, name), getattr(piece, name))) for name in ('energy', 'l3', 'lz')}
@@ -150,11 +152,7 @@ class Survey:
         if run is not None:
             with np.errstate(all='ignore'):         # a log may hold any numbers
                 self._follow(run)
-                for motion in self.motions:
-                    try:
-                        motion.measure(reader)
-                    except MALFORMED as error:
-                        notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
+                self._measure(reader)
 
     def _follow(self, run: recorded_run.RunDescription) -> None:
         """Compute the motions of a run."""
@@ -173,6 +171,19 @@ class Survey:
                 motions.append(Motion(done.event.kind, simulation, run.topics, self.end_ns))
         except MALFORMED as error:
             self.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
+
+    def _measure(self, reader: LogReader) -> None:
+        """Measure the motions; a source is read once for all of them."""
+        ends_ns = [motion.end_ns for motion in self.motions]
+        for source in dict.fromkeys(one.source for one in self.motions if one.source):
+            for at, messages in itertools.groupby(
+                    reader.messages([source]), lambda one: bisect_left(ends_ns, one.log_time)):
+                if at == len(ends_ns) or self.motions[at].source != source:
+                    continue
+                try:
+                    self.motions[at].measure(messages, self.begin_ns)
+                except MALFORMED as error:
+                    self.notes.append(f'{source} cannot be measured: {reason_of(error)}')
 
 
 def _topics(reader: LogReader) -> dict[str, dict[str, Any]]:
