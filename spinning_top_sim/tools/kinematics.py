@@ -61,21 +61,18 @@ def white(values: Reals, jumps: bool = True) -> float:
 
 def _hat(vectors: Reals) -> Reals:
     """Return the matrices (n, 3, 3) of cross products with vectors (n, 3)."""
-    matrices: Reals = np.cross(vectors[:, np.newaxis, :], np.eye(3)).transpose(0, 2, 1)
-    return matrices
+    return np.cross(vectors[:, np.newaxis, :], np.eye(3)).transpose(0, 2, 1)
 
 
 def _vee(matrices: Reals) -> Reals:
     """Return the vectors (n, 3) of the antisymmetric parts of matrices (n, 3, 3)."""
     upper, lower = matrices[:, [1, 2, 0], [2, 0, 1]], matrices[:, [2, 0, 1], [1, 2, 0]]
-    vectors: Reals = 0.5 * (lower - upper)
-    return vectors
+    return 0.5 * (lower - upper)
 
 
 def along(matrices: Reals, vectors: Reals) -> Reals:
     """Return the products of matrices (n, 3, 3) and vectors (n, 3)."""
-    products: Reals = np.einsum('nij,nj->ni', matrices, vectors)
-    return products
+    return np.einsum('nij,nj->ni', matrices, vectors)
 
 
 @dataclass

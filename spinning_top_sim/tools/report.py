@@ -48,9 +48,6 @@ class Mark(NamedTuple):
     meaning: str = ''
 
 
-NO_MARK = Mark(math.nan)
-
-
 @dataclass(frozen=True)
 class Report:
     """
@@ -123,7 +120,7 @@ class Report:
         of_scenes = {tuple(name.split(': ', 1)): known[name] for name in known if ': ' in name}
         limits = {what: _number(mark.limit) for (what, _), mark in of_scenes.items()}
         if of_scenes:
-            rows = [(scene, *(_number(of_scenes.get((what, scene), NO_MARK).value)
+            rows = [(scene, *(_number(of_scenes.get((what, scene), Mark(math.nan)).value)
                               for what in limits))
                     for scene in dict.fromkeys(scene for _, scene in of_scenes)]
             yield from cli.table_lines('Scenes', ('scene', *limits),

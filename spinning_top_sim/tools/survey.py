@@ -177,11 +177,11 @@ class Survey:
         ends_ns = [motion.end_ns for motion in self.motions]
         for source in dict.fromkeys(one.source for one in self.motions if one.source):
             for at, messages in itertools.groupby(
-                    reader.messages([source]), lambda one: bisect_left(ends_ns, one.log_time)):
-                if at == len(ends_ns) or self.motions[at].source != source:
-                    continue
+                    reader.messages([source], end=ends_ns[-1] + 1),
+                    lambda one: bisect_left(ends_ns, one.log_time)):
                 try:
-                    self.motions[at].measure(messages, self.begin_ns)
+                    if self.motions[at].source == source:
+                        self.motions[at].measure(messages, self.begin_ns)
                 except MALFORMED as error:
                     self.notes.append(f'{source} cannot be measured: {reason_of(error)}')
 
