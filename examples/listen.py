@@ -18,7 +18,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_sensor_data
 
-MOST_NUMBERS = 12       # of a line; covariances and long arrays are left out
+MOST_NUMBERS = 13       # of a line; covariances and long arrays are left out
 
 
 def numbers(message, within=''):

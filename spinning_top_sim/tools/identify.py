@@ -68,9 +68,8 @@ def rms(values: Reals) -> float:
 
 def instead(name: str, evidence: str) -> Judge:
     """Return a judge of the last two effects: the second is there instead of the first."""
-    def judge(found: Reals) -> Finding | None:
-        return Finding(name, evidence) if np.allclose(found[-2:], (-1.0, 1.0), atol=NEAR) else None
-    return judge
+    return lambda found: Finding(name, evidence) if np.allclose(
+        found[-2:], (-1.0, 1.0), atol=NEAR) else None
 
 
 class Model:

@@ -198,6 +198,6 @@ def parse_yaml(text: str | bytes, source: str) -> object:
 def likely_name(name: str, known: Iterable[str] = parameters.BY_NAME, prefix: str = '') -> str:
     """Return a hint at the known names, behind the prefix, that are most like an unknown one."""
     names, asked = list(known), name.removeprefix(prefix)
-    near = difflib.get_close_matches(asked, names, 1) or [
-        one for one in names if all(word in one for word in re.split('[._]', asked))][:3]
+    near = [one for one in names if all(word in one for word in re.split('[._]', asked))][
+        :3] or difflib.get_close_matches(asked, names, 1)
     return f'; did you mean {" or ".join(prefix + one for one in near)}?' if near else ''

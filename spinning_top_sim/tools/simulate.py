@@ -90,7 +90,6 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
             raise ValueError(f'--command {text}: T must be from 0 to the end of the run, '
                              f'{duration_ns / NANOSECONDS:g} s')
         stops.append((at_ns, text, {'l3': l3, 'lz': lz}))
-    # The sort is stable: commands at the same time keep their order.
     return [*sorted(stops, key=itemgetter(0)), (duration_ns, '', {})]
 
 

@@ -123,6 +123,8 @@ class Motion:
         if sum(len(stamps_ns) for stamps_ns, _ in parts) < 2:
             return
         stamps_ns, rows = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
+        if not piece.rests:
+            rows[TURNS] = np.nan        # they jump by whole turns
         self.states = states = SampledStates(piece.top, 1e-9 * (stamps_ns - log_ns), rows)
         if piece.rests and not np.isnan(states.l3).all():   # else it has other constants
             self.drifts = {name: _largest(relative_drift(
@@ -176,9 +178,8 @@ class Survey:
         """Measure the motions; a source is read once for all of them."""
         ends_ns = [motion.end_ns for motion in self.motions]
         for source in dict.fromkeys(one.source for one in self.motions if one.source):
-            for at, messages in itertools.groupby(
-                    reader.messages([source], end=ends_ns[-1] + 1),
-                    lambda one: bisect_left(ends_ns, one.log_time)):
+            for at, messages in itertools.groupby(reader.messages([source], 0, ends_ns[-1] + 1),
+                                                  lambda one: bisect_left(ends_ns, one.log_time)):
                 try:
                     if self.motions[at].source == source:
                         self.motions[at].measure(messages, self.begin_ns)

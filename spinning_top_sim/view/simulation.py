@@ -162,6 +162,9 @@ class OwnSimulation:
         elif shown != self._shown:
             self._begin(scene, with_numbers(self.track.values, shown))
             self._shown = shown
+            for slider in self._sliders:        # a number that is typed may be beyond its ends
+                slider.min, slider.max = (min(slider.min, slider.value),
+                                          max(slider.max, slider.value))
 
     def update(self, seconds: float) -> int:
         try:

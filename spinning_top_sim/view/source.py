@@ -113,8 +113,9 @@ class Track(ABC):
         states = self.at(self.times(begin_ns, end_ns, 10 * longest_ns))
         # At most so fast are a nutation, and the axis with its energy.
         w1, w2, _ = states.rows_angular_velocity
-        rates = np.abs(states.l3) / top.lambda1 + np.sqrt(w1 * w1 + w2 * w2 + 2.0 / top.lambda1 * (
-            top.gravity_torque * states.rows_axis[2] + abs(top.gravity_torque)))
+        rates = np.abs(states.l3) / top.lambda1 + np.sqrt(
+            w1 * w1 + w2 * w2 + 2.0 / top.lambda1 * np.maximum(
+                top.gravity_torque * states.rows_axis[2] + abs(top.gravity_torque), 0.0))
         rate = float(np.max(rates, where=np.isfinite(rates), initial=1e-9))
         motion = self.motion_at(end_ns)
         found = motion.description if motion else None
