@@ -152,7 +152,7 @@ contains it has no physical meaning.
 
 ## Commands
 
-The help of each executable, in the site. `ros2 run spinning_top_sim NAME` runs the same.
+The site has the help of each command here; `spinning-top NAME --help` prints it. `ros2 run spinning_top_sim NAME` runs the same.
 """
 
 EFFECTS = {Effect.NOW: 'at once', Effect.RESET: 'reset',
