@@ -290,13 +290,13 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
         assert 500 <= (slider.max - slider.min) / slider.step <= 5000
         assert round(slider.step, slider.precision) == slider.step
     for label, value in (('mass', 3.0), ('length', 0.1), ('moment λ₁', 0.2), ('moment λ₃', 0.1),
-                         ('tilt', 50.0), ('spin', 20.0), ('precession', 1.0)):
+                         ('tilt', 50.0), ('spin', 60.0), ('precession', 1.0)):
         desk.put(label, value)
         assert own.update(0.0) == 0
     top = Top(mass=3.0, com_distance=0.1, lambda1=0.2, lambda3=0.1, gravity=9.80665)
-    start = State.from_rates(math.radians(50.0), 1.0, 0.0, 20.0, top=top)
+    start = State.from_rates(math.radians(50.0), 1.0, 0.0, 60.0, top=top)
     track = own.track
-    assert track.top == top
+    assert track.top == top and desk.inputs['spin ψ′ [rad/s]'].max == 60.0    # beyond its end
     assert track.state(NANOSECONDS).quaternion == pytest.approx(
         solve(top, start, [1.0]).quaternion, abs=1e-9)
     assert track.about.startswith('Scene looping with other numbers; ')

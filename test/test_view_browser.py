@@ -147,7 +147,7 @@ def test_a_file_without_a_network(browser, tmp_path):
             visit.read(words)
         visit.read(r'Cusps(\n.*)*t = [01]\.\d* s, stamp [12]\.')
         visit.read(r'Loops(\n.*)*t = [3-5]\.\d* s, stamp [4-6]\.')
-        # The marks follow the scene.
-        visit.page.wait_for_function(
+        visit.page.wait_for_function(       # the potential of one motion, and marks
+            "document.querySelectorAll('.potential:not([hidden])').length === 1 && "
             "document.querySelector('.plot:last-child .now').getAttribute('transform')"
             " !== 'translate(46 0)'")
