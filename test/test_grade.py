@@ -170,7 +170,7 @@ def at_rest(t):
     (lambda t: None, 'must have attitudes'),
     (lambda t: np.ones((len(t), 4)), 'the norm must be 1'),
     (lambda t: np.eye(4)[:1], '(1, 4), 0 numbers are not finite: must be (1001, 4)'),
-    (lambda t: {'poses': 1}, "has ['poses']: must have attitudes"),
+    (lambda t: {'attitudes': t, 'accelerometer': t}, "'accelerometer']: must have attitudes, and"),
     (lambda t: {'attitudes': at_rest(t), 'rates': 0.0 * at_rest(t)[:, :3] + np.nan},
      '3003 numbers are not finite'),
     (lambda t: {'attitudes': at_rest(t), 'gyroscope': 'no'}, 'run raises ValueError')])

@@ -89,8 +89,9 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
             'attitudes', *KINDS) if said.get(name) is not None}
     except (Exception, SystemExit) as error:
         raise ValueError(f'run raises {type(error).__name__}: {one_line(error)}') from error
-    if 'attitudes' not in readings:
-        raise ValueError(f'what is returned has {[*said]}: must have attitudes')
+    if 'attitudes' not in readings or not said.keys() <= {'attitudes', *KINDS}:
+        raise ValueError(f'what is returned has {[*said]}: must have attitudes, and may have '
+                         f'{", ".join(KINDS)}')
     for name, values in readings.items():
         shape, bad = (len(times), 4 if name == 'attitudes' else 3), ~np.isfinite(values)
         if values.shape != shape or np.any(bad):
