@@ -56,7 +56,8 @@ help:
 #:              cusp fast_gyroscope free_top heavy_top looping near_separatrix
 #:              planar_pendulum sleeping spherical_pendulum steady_fast
 #:              steady_slow waking_sleeper wavy  with a moving pivot: braking
-#:              elevator free_fall shuttle  or the path of a parameter file
+#:              elevator free_fall shuttle  or the path of a parameter file;
+#:              IMU=bmi088 gives the readings the errors of an IMU
 run:
 	$(INSTALL) '$(VENV)/.deps-plot' '$(VENV)/.deps-ros-$(ROS)' '$(VENV)/.package'
 	@test -e 'config/$(SCENE).yaml' -o -e '$(SCENE)' || $(BIN)/spinning-top' node --scene '$(SCENE)'
@@ -67,7 +68,7 @@ run:
 	@echo "  export ROS_DOMAIN_ID=$$ROS_DOMAIN_ID" \
 	    "ROS_AUTOMATIC_DISCOVERY_RANGE=$$ROS_AUTOMATIC_DISCOVERY_RANGE"
 	@echo '  python examples/listen.py pose'
-	@exec $(BIN)/spinning-top' node --scene '$(SCENE)' --ros-args -p record.enabled:=true \
+	@exec $(BIN)/spinning-top' node --scene '$(SCENE)' $(if $(IMU),--imu '$(IMU)') --ros-args -p record.enabled:=true \
 	    -p 'record.uri:=$(LOGS)/' $(ARGS)
 
 #: make view    simulate a scene in the browser, without ROS; SCENE=... PORT=8080
