@@ -19,7 +19,6 @@ from spinning_top_sim.streams.topics import INVARIANTS
 
 @pytest.fixture
 def node(tmp_path):
-    """A paused node at its start."""
     with OwnNode(tmp_path, start_paused=True) as node:
         yield node
 
@@ -51,8 +50,9 @@ def test_a_command_sets_the_momenta(node, command, l3, lz):
     assert np.abs(invariants[1:3] - (l3, lz)).max() < 1e-11
 
 
-def test_a_spin_that_is_set_beside_the_start_is_that_of_the_next_start(node):
+def test_a_spin_that_is_set_beside_the_start_is_that_of_the_next_start(node, capfd):
     assert node.set(initial__theta=0.5, spin__l3=2.0).successful
+    assert 'initial.theta: a change takes effect at the next ~/reset' in capfd.readouterr().err
     assert node.loop.commands == 0 and node.trigger('reset').success
     assert node.get('spin.l3') == [2.0] and node.simulation.state().theta == 0.5
 

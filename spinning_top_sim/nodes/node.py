@@ -32,9 +32,8 @@ from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.status import NodeStatus
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.times import NANOSECONDS
-
-LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
 
 
 class Simulator(Node):
@@ -71,8 +70,7 @@ class Simulator(Node):
         self._timer_of: dict[str, Timer] = {}       # by what it does
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._topics.open(values)
-        self._diagnostics = publishers.create_publisher(
-            self, DiagnosticArray, '/diagnostics')
+        self._diagnostics = publishers.create_publisher(self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
@@ -119,7 +117,7 @@ class Simulator(Node):
             self._begin()
         elif state is LoopState.ENDED and 'end' not in self._timer_of:     # ticks go on
             publishers.wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self._every('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
+            self._every('end', 0.2, lambda: self.finished.set_result(None))     # after answers
 
     def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
         """Call back in steady time, each `period` [s], instead of what this timer did before."""
@@ -195,6 +193,9 @@ class Simulator(Node):
         self.values_next = values
         if others.keys() & {'tick_rate', 'time_scale'}:
             self._align_ticks()
+        for name in sorted(others):
+            if (effect := parameters.BY_NAME[name].effect) is not Effect.NOW:
+                self._log.info(f'{name}: {effect.value}')
 
     def _command(self, given: Mapping[str, Any]) -> None:
         command = parameters.checked_changes(given)

@@ -112,8 +112,7 @@ class Recording:
     def has_room(self, wait_s: float = 0.0) -> bool:
         """Return whether the recorder takes more messages, after a wait at most."""
         recorder = self._recorder
-        return recorder is None or recorder.room or bool(
-            wait_s and recorder.wait_for_room(wait_s))
+        return recorder is None or recorder.room or bool(wait_s and recorder.wait_for_room(wait_s))
 
     @property
     def warning(self) -> str | None:
