@@ -62,6 +62,8 @@ def test_what_a_slow_clock_makes_due_is_on_time_for_half_a_second():
     for steady_ns, second, late_ns in (
             (0, 201, -1), (400, 202, -1), (499, 202, -1), (500, 202, 1 * S), (900, 202, 2 * S)):
         assert top.tick(steady_ns * MS, second * S)[1] == late_ns
+    top.begin(300 * S, 950 * MS)
+    assert top.tick(1400 * MS, 301 * S)[1] == -1, 'what was due of the motion before'
 
 
 @pytest.mark.parametrize('lag_ns', [5 * MS, 30 * MS, 990 * S])

@@ -35,6 +35,7 @@ def each_failing(act, check, more=()):
             with Calls(number, error):
                 found = act(f'{number}_{error}')
             check(found, f'{name}, call {number}, fails with {error}')
+    return calls.names
 
 
 def test_of_a_recording(tmp_path):
@@ -117,7 +118,9 @@ def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
                 kept == messages[:len(kept)] if messages else
                 'unlink' in failure and not path.stat().st_size), failure
 
-    each_failing(act, check, more=[KeyboardInterrupt] if kind in ('recovery', 'mcap') else ())
+    is_log = kind in ('recovery', 'mcap')
+    names = each_failing(act, check, more=[KeyboardInterrupt] if is_log else ())
+    assert ('fsync' in names) == is_log, 'a log is on the disk'
 
 
 def test_of_a_part_of_an_ensemble(tmp_path):

@@ -56,20 +56,6 @@ def test_the_log_gets_an_instant_before_subscribers_and_those_that_fail_get_a_re
     assert (len(taken), pose.sent, pose.skipped) == (count, 152, 49)
 
 
-def test_subscribers_get_what_is_due_in_the_order_of_time():
-    simulation, heard, numbers = simulate(joint_states__rate=50.0), [], (0, 1, 3)
-    for number in numbers:
-        one = simulation.outputs[number]
-        one.publish = lambda data, one=one, number=number: heard.append(
-            (int(one.channel.template.stamps_ns(data)[0]) - EPOCH_NS, number))
-    simulation.refresh()
-    for until_ns in range(0, SECOND, 7 * MILLISECOND):
-        simulation.send(until_ns)
-        assert heard == sorted((t_ns, number) for number in numbers for t_ns in range(
-            0, until_ns + 1, simulation.channels[number].period_ns))
-        simulation.look_ahead(until_ns + SECOND, 1e-2)
-
-
 def test_a_long_integration_is_divided_and_leaves_a_state_to_read(monkeypatch):
     """A wheel so fast that a sample takes thousands of steps; and a clock far ahead of it."""
     fast = {'spin.l3': 1e4, 'joint_states.rate': 500.0}
@@ -163,5 +149,11 @@ def test_motions_are_forgotten_when_nothing_reaches_back_to_them():
         simulation.apply('command', l3=1.6 + 0.001 * tick, lz=1.4)
     kept = simulation.trajectory.starts(0, 7 * SECOND)
     assert 3 * SECOND // 2 <= kept[0] <= 2 * SECOND and kept[-1] == 6 * SECOND
+    held = [one for one in vars(simulation.trajectory).values() if isinstance(one, list | tuple)]
+    assert max(map(len, held)) <= 1 + len(kept), 'nothing grows'
+    assert simulation.trajectory.evaluations > 6 * simulation.trajectory.steps > 0, 'of all'
     with pytest.raises(LookupError, match=r't = 0 ns: the motion before .* is forgotten'):
         simulation.trajectory.evaluate(np.array([0]))
+    play(simulation, 20 * SECOND, 'pose')           # nor are steps kept offline
+    with pytest.raises(dormand_prince.IntegrationError, match='the oldest one that is kept'):
+        simulation.trajectory.evaluate(np.array([10 * SECOND]))

@@ -180,7 +180,8 @@ def test_extra_fields_and_unknown_kinds_are_no_damage_and_the_order_is_kept(tmp_
     path = closed(
         tmp_path, padded(struct.pack('<BQ', 0x80, 0), b'of an application'), message(5, b'1'),
         padded(chunk_of(message(5, b'2') + message(5, b'3')), b'\x00' * 20),
-        padded(record_bytes(MetadataRecord('note', {'a': 'b'})), b'\x06'), message(5, b'4'),
+        *(padded(record_bytes(MetadataRecord('note', {'a': text})), b'\x06') for text in 'xb'),
+        message(5, b'4'),
         padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind'),
         record_bytes(no_schema), message(5, b'5', channel=2))
     with LogReader(path) as reader:
@@ -205,8 +206,7 @@ def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
         assert reader.get_header() == Header(profile='', library='a stranger')
         (note,), (attachment,) = reader.iter_metadata(), reader.iter_attachments()
         assert (note.name, note.metadata) == ('note', {'a': 'ä', 'b': ''})
-        assert (attachment.name, attachment.media_type, attachment.data) == (
-            'calibration.bin', 'x/y', b'\x06' * 3000)
+        assert attachment == Attachment(3, 4, 'calibration.bin', 'x/y', b'\x06' * 3000)
         read = [*reader.iter_messages()]
         assert read[0][1].metadata == {'unit': 'm'} and read[0][0].data == b'{"type": "object"}'
         assert [message.publish_time for *_, message in read] == [
@@ -227,7 +227,7 @@ FIRST, SECOND = message(5, b'first'), message(5, b'second' * 50)
 
 @pytest.mark.parametrize('bad', [
     chunk_of(FIRST, 'zstd', zstandard.compress(FIRST + SECOND), uncompressed_crc=0),   # too much
-    chunk_of(b'', 'lz4', lz4.frame.compress(bytes(1 << 26)), uncompressed_size=1 << 40),
+    chunk_of(bytes(9 << 16), 'lz4', lz4.frame.compress(bytes(9 << 16))),
     chunk_of(FIRST, uncompressed_crc=7), chunk_of(FIRST, 'zstd', b'noise'),
     chunk_of(message(5, b'', channel=7)), chunk_of(FIRST, 'brotli'), chunk_of(FIRST[:-1]),
     chunk_of(message(5, bytes(5000))), record_bytes(MetadataRecord('big', {'k': 'v' * 5000}))])
@@ -239,10 +239,10 @@ def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
 
 
 def test_a_small_file_whose_chunks_unpack_to_all_memory_is_refused(tmp_path):
-    bomb = message(5, b'') + message(9, bytes(1 << 16))
+    bomb = message(5, b'') + 100 * message(9, bytes(300))      # half of it besides the data
     path = closed(tmp_path, *[chunk_of(bomb, 'zstd', zstandard.compress(bomb))] * 9)
     with LogReader(path, max_bytes=1 << 20) as reader:
-        assert len([*reader.messages()]) == 18
+        assert len([*reader.messages()]) == 909
     with LogReader(path, max_bytes=1 << 18) as reader, pytest.raises(
             LogError, match='more than 262144 bytes of them are not held'):
         list(reader.messages())

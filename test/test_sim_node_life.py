@@ -81,14 +81,14 @@ def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(
         (path,) = (tmp_path / 'new/er.mcap').iterdir()
         assert answers == 2 * [f'recording to {path}']
         with monkeypatch.context() as patch:
-            patch.setattr(McapWriter, 'flush', full)
+            patch.setattr(McapWriter, '_write_chunk', full)
             node.spin_until('an error', lambda: node.diagnostics()[0] == 2)
         level, message, said = node.diagnostics()
         assert (level, said['recorder'], said['state']) == (2, 'failed', 'running')
         assert f'{path}' in message and 'No space left' in message
     errors = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
     assert ['not recording' in line for line in errors] == 3 * [True]
-    assert precious.read_bytes() == b'precious'
+    assert precious.read_bytes() == b'precious' and log_of(path), 'it has a summary'
 
 
 def test_who_ends_the_recording_behind_the_end_still_gets_an_answer(tmp_path):

@@ -179,7 +179,9 @@ class World:
 
     def reset(self, paused):
         momenta = {name: self._start[name] for name in ('spin.l3', 'spin.lz')}
+        was_on = self.recording.is_on
         self.loop.reset({**self.values, **momenta}, paused)
+        assert was_on == self.recording.is_on or 'gone back' in self.recording.error
 
     def change(self, changes):
         values = {**self.values, **changes}
@@ -308,6 +310,7 @@ class World:
         self._tick_until(max(machine.now_ns, self._cost_until_ns, self._stops_at_ns) + QUIET_NS)
         self._tick()
         self._check_time(is_quiet=True)
+        assert self.recording.has_room() or self.disk.is_disturbed, 'a full queue is emptied'
         before_ns, had_room = self.simulation.sent_ns, self.recording.has_room()
         self._tick_until(machine.now_ns + QUIET_NS)
         # Simulated time may be held before the stamp of t = 0.

@@ -73,7 +73,7 @@ def check_readers(world, sent):
             place = next((place for place, _, one in rest if one == data), None)
             assert place is not None, f'{topic}: what was heard is not what was sent'
             if topic[0] != '~':     # two messages without a stamp may be the same
-                order[number] = place
+                order[number] = (*place, world.simulation.outputs.index(reader.output))
         heard[topic] += len(reader.heard)
         missing[topic] += len(expected) - len(reader.heard)
     for output in world.simulation.outputs:

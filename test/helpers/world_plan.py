@@ -106,7 +106,7 @@ def _values(chance, streams):
               'time_scale': chance.choice((1.0, 1.0, 1.0, 0.5, 3.0)),
               'seed': chance.randrange(1000), 'start_paused': chance.random() < 0.1,
               # To open a file, to write and to sync takes up to 40 ms.
-              'record.max_loss': chance.choice((0.1, 0.2, 0.3)), 'record.min_free_bytes': 0,
+              'record.max_loss': chance.choice((0.1, 0.3, 60.0)), 'record.min_free_bytes': 0,
               'record.compression': chance.choice(('zstd', 'lz4', 'none')),
               'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.gyroscope_noise_density': 0.01,
               'imu.gyroscope_random_walk': 0.001, 'markers.trace_length': 0.2,
