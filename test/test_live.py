@@ -134,8 +134,9 @@ def test_after_a_change_of_the_rates_every_topic_goes_on_on_the_new_grid():
     simulation = simulate(dict.fromkeys(rates, 1000.0))
     taken = record(simulation)
     simulation.send(changed_at)
-    simulation.apply('parameters', **dict.fromkeys(rates, 33.0))
+    simulation.apply('parameters', **dict.fromkeys(rates, 33.0), world_frame='later')
     simulation.send(until_ns)
+    assert b'later' not in b''.join(data for *_, data in taken), 'at the next reset'
     for one in simulation.channels:
         assert times(taken, one.topic) == [*range(0, changed_at + 1, MILLISECOND), *(
             t for t in range(0, until_ns + 1, round(SECOND / 33)) if t > changed_at)], one.topic

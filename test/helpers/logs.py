@@ -112,7 +112,7 @@ def write_stranger(path, options, count=300):
             topic = ('/json', '/raw')[number % 2]
             data = b'{"n": %d}' % number if topic == '/json' else (
                 random.Random(number).randbytes(number % 70))
-            writer.add_message(channels[topic], 1000 + number, data, 2000 + number)
+            writer.add_message(channels[topic], 1000 + number, data, 2000 + number, number // 2)
             messages.append((topic, 1000 + number, data))
             if number == count // 2:
                 writer.add_attachment(3, 4, 'calibration.bin', 'x/y', b'\x06' * 3000)
