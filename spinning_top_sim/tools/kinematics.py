@@ -198,9 +198,11 @@ def stretches(parts: Parts) -> tuple[list[Stretch], float]:
     intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in parts.items()}
     step, sigma, spans = max(intervals.values()), {}, [(-math.inf, math.inf)]
     for name, (at, rows) in parts.items():
-        gaps = np.flatnonzero(np.diff(at) > GAP * intervals[name])
-        pieces = [*zip([0, *gaps + 1], [*gaps + 1, len(at)], strict=True)]
-        squares = [(_noise(name, rows[a:b]) ** 2, b - a) for a, b in pieces if b - a > 2 * ORDER]
+        # Differences tell noise only where no sample is missing.
+        lost, gaps = (np.flatnonzero(np.diff(at) > most * intervals[name]) for most in (1.5, GAP))
+        whole, pieces = ([*zip([0, *one + 1], [*one + 1, len(at)], strict=True)]
+                         for one in (lost, gaps))
+        squares = [(_noise(name, rows[a:b]) ** 2, b - a) for a, b in whole if b - a > 2 * ORDER]
         sigma[name] = math.sqrt(sum(one * n for one, n in squares)
                                 / max(sum(n for _, n in squares), 1))
         spans = [(max(first, at[a]), min(last, at[b - 1])) for first, last in spans
