@@ -53,7 +53,7 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
            f'the body turns by more than {MOST:g} rad between two samples'
            if any(body.coarse for body in bodies) else '')
     if why:
-        return Report(subject, faults, unjudged=[f'readings: {why}'])
+        return Report(subject, faults, unjudged=[f'readings: {why}', *unjudged])
     convention = convention_of(bodies, imu, gravity)
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
