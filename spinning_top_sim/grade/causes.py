@@ -53,8 +53,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
     late, sigma, unjudged = math.nan, math.inf, [*_untold(compared, model)]
-    # If there is nothing else; if that does not tell, whatever matrix and bias there are.
-    whatever = model.fit(['step', *MATRIX, *OFFSETS])
+    # If there is nothing else; if that does not tell, whatever matrix, bias and a x r there are.
+    whatever = model.fit(['step', *MATRIX, *OFFSETS, *(k for k in model.names if 'turned' in k)])
     for fit in [alone] if either else [whatever] if found else [alone, whatever]:
         if not abs(late) + 1.96 * sigma <= LATE:
             late, sigma = (compared.steps * float(one[len(model.always)])

@@ -148,8 +148,9 @@ class Comparison:
             smooth = pair[0].smooth[keep]
             for motion, parts in zip(pair, (plain, noisy), strict=True):
                 effects = self.columns(motion)
-                read = self.read(motion, lag)           # which has less noise than the motion
-                effects |= {TARGET: read - effects['total'], 'step': np.gradient(read, axis=0)}
+                read = self.read(motion, lag)
+                effects |= {TARGET: read - effects['total'], 'step': np.gradient(
+                    read if self.noisy else effects.get('whole', read), axis=0)}
                 parts.append({name: one[keep][smooth] / size for name, one in effects.items()})
         return Model(plain, noisy, self.always)
 
@@ -161,7 +162,7 @@ class Comparison:
             effects = {f'field {k}': motion.back @ axis for k, axis in enumerate(AXES)}
             effects['total'] = motion.back @ self.field
         else:
-            effects = {'rates': motion.rates, 'total': motion.rates}
+            effects = dict.fromkeys(('rates', 'total', 'whole'), motion.rates)
         total = effects['total']
         arms = self.always if self.kind == 'accelerations' else []
 
@@ -185,7 +186,7 @@ class Comparison:
         gravity, moved = self.gravity * motion.back @ UP, motion.acceleration + second @ self.arm
         return {
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
-            'linear': motion.acceleration, 'lever': second @ self.arm,
+            'linear': motion.acceleration, 'lever': second @ self.arm, 'whole': gravity + moved,
             'total': gravity + (motion.acceleration if self.always else moved),
             'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.
