@@ -100,7 +100,7 @@ def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:
     try:
         lines = [line.strip(' ') for line in path.read_text('utf-8-sig').splitlines()]
     except UnicodeDecodeError as error:
-        raise ValueError('it is no text in UTF-8: convert it, as by iconv -f latin1') from error
+        raise ValueError('it is no text in UTF-8: convert it, as by iconv or gunzip') from error
     bare = ['' if line[:1] == '#' else line for line in lines]
     first = next(filter(str.strip, bare), '')
     mark = next((mark for mark in ',;\t' if mark in first), ' ')

@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.causes import CLEARLY, OFFSETS, judge
+from spinning_top_sim.grade.causes import CLEARLY, DENSITIES, OFFSETS, judge
 from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, UP, Comparison, Imu
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
 from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-EXCERPT_S, SAMPLES = 5.0, (1000, 3000)        # of a motion by which a convention is found
+EXCERPT = 2000          # samples of a motion by which a convention is found, to be fast
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.95    # of a hold: runs of equal rows, share of equal length
+JUMP = 10.0             # times a step of poses is longer than those beside and than usual
 
 
 def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STANDARD_GRAVITY,
@@ -41,25 +42,26 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     """
     imu, new = imu or Imu(), {name: held(name, values) for name, (_, values) in parts.items()}
     faults = [fault for _, found in new.values() for fault in found]
-    bodies, left_out = stretches({name: (times[new[name][0]], values[new[name][0]])
-                                  if new[name][1] else (times, values)
+    rows = {name: new[name][0] if new[name][1] else slice(None) if name in READINGS else
+            smooth(values) for name, (_, values) in parts.items()}
+    bodies, left_out = stretches({name: (times[rows[name]], values[rows[name]])
                                   for name, (times, values) in parts.items()})
-    notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] * bool(left_out > 0.0)
+    unjudged = [f'{left_out:.3g} s in gaps, at jumps of poses, or between'] * bool(left_out > 0.0)
+    unjudged += (f'{name}: there is none' for name in DENSITIES if name not in parts)
     why = ('beside held poses' if any(new[name][1] for name in new.keys() - READINGS.keys()) else
            'no part without a gap is long enough' if not bodies else
            f'the body turns by more than {MOST:g} rad between two samples'
            if any(body.coarse for body in bodies) else '')
     if why:
-        return Report(subject, faults, {}, notes, unjudged=[f'readings: {why}'])
+        return Report(subject, faults, unjudged=[f'readings: {why}', *unjudged])
     convention = convention_of(bodies, imu, gravity)
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
                               'undone'))
         bodies = [undone(body, convention) for body in bodies]
-    return Report(subject, faults, {}, notes).plus(*(
+    return Report(subject, faults, unjudged=unjudged).plus(*(
         judge(name, bodies, imu, gravity) if 'positions' in parts or name != 'accelerations' else
-        Report('', unjudged=[f'{name}: without positions'] * (name in parts))
-        for name in READINGS))
+        Report('', unjudged=[f'{name}: without positions']) for name in READINGS if name in parts))
 
 
 def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:
@@ -71,6 +73,14 @@ def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:
     count = float(np.mean(usual)) if len(usual) > HELD_SHARE * len(runs) else 1.0
     return new, [Finding('held', f'{name}: each row is told {count:.3g} times: the sensor, or the '
                          'log, is slower than its stamps', count)] * (count >= 1.3)
+
+
+def smooth(values: Reals) -> NDArray[np.bool_]:
+    """Return which poses (n, k) are not beside a jump, a step unlike others and those beside."""
+    steps = np.linalg.norm(np.diff(np.abs(values), axis=0), axis=1)     # q and -q are one
+    beside = np.maximum(np.append(steps[1:], 0.0), np.append(0.0, steps[:-1]))
+    jumps = steps > JUMP * np.maximum(beside, np.median(steps)) + 1e-9
+    return ~(np.append(False, jumps) | np.append(jumps, False))
 
 
 def undone(body: Stretch, convention: Convention) -> Stretch:
@@ -95,7 +105,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     ours, *others = (one for one in conventions.group() if not _of_sensor(one))
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
-    count = min(int(np.clip(EXCERPT_S / body.step, *SAMPLES)), len(angles) - 1)
+    count = min(EXCERPT, len(angles) - 1)
     first = int(np.argmax(angles[count:] - angles[:-count]))
     body = body.part(slice(first, first + count))       # in which it turns the most
     # No convention changes how fast quaternions change, and so none the noise in rates.

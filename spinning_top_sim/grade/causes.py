@@ -9,7 +9,6 @@ possible explain what a right reading does not, and are named by the sizes of th
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,8 +31,9 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
-# By which a size differs from that of a unit, entries from axes, and from a turn, as a share.
-OF_UNIT, OF_AXES, OF_TURN = 0.02, 0.1, 0.3
+# Share by which a size may differ from that of a unit, and entries from those of axes: units are
+# further apart; and of a matrix that is no turn.
+LIKE, OF_TURN = 0.1, 0.3
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
 NOISE_BAND, OF_CHANCE = 0.05, 5.7   # by which noise may differ from what is declared
@@ -47,26 +47,34 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     if not compared.motions:
         return Report(kind, unjudged=[f'{kind}: too few samples'] * (
             any(kind in one.readings for one in stretches)))
-    samples, sigma, clear = compared.lag()
-    late, sigma = samples * compared.steps, sigma * compared.steps
-    model = compared.model(round(samples) if clear else 0)
+    shift = compared.lag()
+    model = compared.model(shift)
     found, rest = Causes(compared, model).find()
-    if math.isnan(late) and found and found[0].name == 'mounting' and (
-            model.fit(['step']).beyond < UNEXPLAINED * model.fit([]).beyond):
-        return Report(kind, unjudged=[f'{kind}: {found[0].evidence}, or readings are late: this '
-                                      'motion does not tell'])
+    right, alone = model.fit([]), model.fit(['step'])
+    either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
+    late, sigma, unjudged = math.nan, math.inf, [*_untold(compared, model)]
+    # If there is nothing else; if that does not tell, whatever matrix, bias and a x r there are.
+    whatever = model.fit(['step', *MATRIX, *OFFSETS, *(k for k in model.names if 'turned' in k)])
+    for fit in [alone] if either else [whatever] if found else [alone, whatever]:
+        if not abs(late) + 1.96 * sigma <= LATE:
+            late, sigma = (compared.steps * float(one[len(model.always)])
+                           for one in (shift - fit.found, fit.sigma))
+    name = 'early' if late < 0.0 else 'late'
+    text = (f'the readings are {abs(late):.3g} {_interval(sigma)} steps of '
+            f'{1e3 * compared.own_step:.3g} ms {name}')
+    is_late = bool(shift or not found) and abs(late) > max(LATE + 1.96 * sigma, SURE * sigma)
+    if not is_late and not abs(late) + 1.96 * sigma <= LATE and (either or not found):
+        or_else = found[0].evidence if found else 'there is no fault'
+        unjudged, found = [f'{kind}: {or_else}, or {text}: this motion does not tell'
+                           f'{_needed(compared, SURE * sigma)}', *unjudged], []
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
-             f'{kind}_discrepancy': Mark(model.fit([]).beyond),
+             f'{kind}_discrepancy': Mark(right.beyond),
              f'{kind}_noise': Mark(compared.reading_noise), **dict(_estimates(kind, model))}
     if kind in DENSITIES and not found:         # beside a fault the noise is not known
         found = [*_noise_faults(compared, model, rest, getattr(imu, DENSITIES[kind]))]
-    if clear and abs(late) > max(LATE, SURE * sigma):
-        found = [Finding(
-            'late' if late > 0.0 else 'early', f'the readings belong to the motion of '
-            f'{abs(late):.3g} steps ({1e3 * abs(late) * compared.own_step:.3g} ms) '
-            f'{"before" if late > 0.0 else "after"}', late), *found]
+    found = [Finding(name, text, late)] * is_late + found
     return Report(kind, [one._replace(evidence=f'{kind}: {one.evidence}') for one in found],
-                  marks, unjudged=[*_untold(compared, model)])
+                  marks, unjudged=unjudged)
 
 
 def _interval(sigma: float) -> str:
@@ -92,19 +100,26 @@ class Causes:
         right = self.model.fit([])
         if self.kind == 'magnetometer' and self.compared.always:
             size, (low, high) = float(np.linalg.norm(right.found)), EARTH_FIELD
-            for unit, factor in self.compared.units.items():
-                if not low < size < high and low < size * factor < high:
-                    return [Finding('units', f'the field is {size:.4g}: it is in {unit}, not in '
-                                    'T', 1.0 / factor)], right
-        if right.beyond <= STRANGE:
-            return [], right
+            units = [name for name, factor in self.compared.units.items()
+                     if low < factor * size < high]
+            # Magnets and iron make no field that is still so large, or so small.
+            odd = right.beyond <= STRANGE and not 0.1 * low < size < 10.0 * high
+            if 'T' not in units and (units or odd):
+                return [Finding('units' if units else 'reading_scale', f'the field is {size:.4g}, '
+                                f'of the Earth {low:g} to {high:g} T, as if in '
+                                f'{"".join(units[:1]) or "no unit"}', size)], right
+        if right.beyond <= STRANGE:     # of each sample: a mean is known better
+            bias = self.model.fit(['step', *OFFSETS])
+            size = float(np.linalg.norm(bias.found[-3:])) * self.model.size(OFFSETS[0])
+            sure = size > STRANGE and np.any((np.abs(bias.found) > SURE * bias.sigma)[-3:])
+            return [*filter(None, [self._bias(bias.found) if sure else None])], right
         found, rest = identify.explain(self.model, [*self._causes(right.beyond)], 0.5 * STRANGE)
+        # Where the terms cannot be seen, as in free fall, noise is.
+        seen = self.kind != 'accelerations' or self._clear('total')
         if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange, 2.0 * rest.noise,
                              (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
-            # Where the terms cannot be seen, as in free fall, noise is.
-            return [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
-                            'that of the motion', rest.beyond)] * (
-                                self.kind != 'accelerations' or self._clear('total')), rest
+            found = [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
+                             'that of the motion', rest.beyond)] * seen
         return found, rest
 
     def _causes(self, before: float) -> Iterator[Cause]:
@@ -142,14 +157,15 @@ class Causes:
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:.3g} times its size'
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < OF_UNIT:
+        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
             return None
         if abs(share) < NEAR:
             return Finding(TERMS[term], text, share)
         if share < 0.0:
             return Finding('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
         if term == 'gravity':
-            return Finding('gravity' * (abs(share - 1.0) > GRAVITY_BAND), text, share)
+            return Finding('gravity' * (abs(share - 1.0) > GRAVITY_BAND and self._clear('total')),
+                           text, share)
         # Noise that is not white makes it smaller.
         return Finding('acceleration_scale' * (not self.noisy), text, share)
 
@@ -180,17 +196,16 @@ class Causes:
         # A unit, or one that is converted twice.
         unit, times = next(((f', in {name}', times) for name, factor in self.compared.units.items()
                             for times in (1.0 / factor, factor)
-                            if factor != 1.0 and abs(size / times - 1.0) < OF_UNIT), ('', 1.0))
+                            if factor != 1.0 and abs(size / times - 1.0) < LIKE), ('', 1.0))
         shape, change = matrix / times, float(np.max(np.abs(matrix - AXES)))
         axes = np.rint(shape)
-        if np.array_equal(axes @ axes.T, AXES) and np.max(np.abs(shape - axes)) < OF_AXES and (
+        if np.array_equal(axes @ axes.T, AXES) and np.max(np.abs(shape - axes)) < LIKE and (
                 unit or not np.array_equal(axes, AXES)):
-            words = ', '.join(f'{axis} reads {one}' for axis, one in zip(
-                'xyz', conventions.axes(axes).split(', '), strict=True))
             return Finding('units' if np.array_equal(axes, AXES) else
                            'reading_sign' if np.array_equal(axes, -AXES) else
                            'sign' if np.array_equal(np.abs(axes), AXES) else 'axes',
-                           f'{words}, {size:.4g} times what it should be{unit}', size)
+                           f'x, y, z read {conventions.axes(axes)}, {size:.4g} times what they '
+                           f'should{unit}', size)
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             name, small = ('rates_scale', STRANGE) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
@@ -199,7 +214,7 @@ class Causes:
         left, _, right = np.linalg.svd(shape)
         turn = left @ right
         if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
-                OF_UNIT, OF_TURN * change):
+                REAL, OF_TURN * change):
             vector = Rotation.from_matrix(turn).inv().as_rotvec()
             angle = float(np.linalg.norm(vector))
             return Finding('mounting' * (angle > self.strange), 'the readings are in axes that '
@@ -225,33 +240,36 @@ def _split_arm(found: Reals) -> Finding | None:
 
 def _estimates(kind: str, model: Model) -> Iterator[tuple[str, Mark]]:
     """Yield what the sensor is found to be, with intervals of 95 %."""
-    def told(names: Sequence[str], right: Reals, effects: Sequence[str]) -> Iterator[Any]:
-        fit, own = model.fit(effects), slice(-len(names), None)
-        for name, value, sigma in zip(names, right + fit.found[own], fit.sigma[own], strict=True):
+    what = 'field' if kind == 'magnetometer' else 'lever_arm'
+    matrix = [f'{kind}_matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES]
+    for effects, names, right in (
+            ([], [f'{what}_{axis}' for axis in 'xyz'] * bool(model.always), np.zeros(3)),
+            ([*MATRIX, *OFFSETS], [*matrix, *(f'{kind}_bias_{axis}' for axis in 'xyz')] * (
+                kind in DENSITIES), np.append(AXES, np.zeros(3)))):
+        fit = model.fit(effects)
+        for name, value, sigma, base in zip(
+                names, fit.found[-len(right):], fit.sigma[-len(right):], right, strict=False):
             if math.isfinite(sigma):
-                yield name, Mark(float(value), meaning=_interval(sigma))
-
-    if model.always:
-        what = 'field' if kind == 'magnetometer' else 'lever_arm'
-        yield from told([f'{what}_{axis}' for axis in 'xyz'], np.zeros(3), [])
-    if kind in DENSITIES:
-        yield from told([*(f'{kind}_matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES),
-                         *(f'{kind}_bias_{axis}' for axis in 'xyz')],
-                        np.append(AXES, np.zeros(3)), [*MATRIX, *OFFSETS])
+                yield name, Mark(float(base + value), meaning=_interval(sigma))
 
 
 def _untold(compared: Comparison, model: Model) -> Iterator[str]:
     """Yield what cannot be told of the readings, and the poses that could tell it."""
-    turns, places = (max(one.body.sigma.get(name, 0.0) for one, _ in compared.motions)
-                     for name in ('attitudes', 'positions'))
-    for name in {'accelerations': ('centripetal', 'linear'), 'magnetometer': ()}.get(
+    for name in {'accelerations': ('centripetal', 'linear', 'total'), 'magnetometer': ()}.get(
             compared.kind, ('total',)):
         sigma = float(model.fit([name]).sigma[-1])
-        if (worse := SURE * sigma / TELLS) > 1.0 and model.clear(name, 1.5):
-            yield (f'{compared.kind}: the size of the term {name} is known to '
-                   f'+- {196.0 * sigma:.2g} % only' + (
-                       f'; poses with noise of {turns / worse:.2g} rad, {places / worse:.2g} m '
-                       'would tell' if compared.noisy and worse < math.inf else ''))
+        if SURE * sigma > TELLS and (model.clear(name, 1.5) or name == 'total'):
+            also = ', and of a bias,' if name == 'centripetal' and compared.noisy else ''
+            yield (f'{compared.kind}: the size of the term {name}{also} is known to '
+                   f'+- {196.0 * sigma:.2g} % only' + _needed(compared, SURE * sigma / TELLS))
+
+
+def _needed(compared: Comparison, worse: float) -> str:
+    """Return the noise of poses, less by a factor, that would tell."""
+    turns, places = (max(one.body.sigma.get(name, 0.0) for one, _ in compared.motions) / worse
+                     for name in ('attitudes', 'positions'))
+    return (f'; poses with noise of {turns:.2g} rad, {places:.2g} m would tell'
+            if compared.noisy and 1.0 < worse < math.inf else '')
 
 
 def _noise_faults(compared: Comparison, model: Model, rest: Fit,

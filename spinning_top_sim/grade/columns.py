@@ -4,7 +4,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,19 +19,16 @@ NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR, NOISY = 0.03, 1e-3   # noise of rates or forces, relative: small enough; not negligible
 ARM = np.full(3, 0.06)  # of an IMU whose place is not known [m]
 LAGS = range(-5, 41)    # that are tried [samples]
-ENOUGH = 3              # independent samples a column, from which on a lag can be told
-STILL = 1e-5            # share of a reading below which no lag is looked for
+EXACT = 1e-5            # share of a reading that differences of poses may leave
 # Terms and effects that any reading may have, along any axes.
 ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field', 'rates'
-_per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 # Units of readings with their sizes, SI first.
 READINGS: dict[str, Mapping[str, float]] = {
     'gyroscope': {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0,
                   'dps': math.pi / 180.0, 'rpm': math.pi / 30.0},
-    'accelerations': {'m/s^2': 1.0, 'm/s2': 1.0, 'g': STANDARD_GRAVITY,
+    'accelerations': {'m/s^2': 1.0, 'm/s2': 1.0, 'm/s²': 1.0, 'g': STANDARD_GRAVITY,
                       'mg': 1e-3 * STANDARD_GRAVITY},
     'magnetometer': {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}}
-LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
 KINDS = {'rates': READINGS['gyroscope'], **READINGS}    # a simulator has those of its state
 OF_TURNS = 'rates', 'gyroscope'
 DENSITIES = {'gyroscope': 'gyroscope_noise_density',
@@ -56,10 +52,7 @@ class Imu:
         Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
         sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
 
-    Raises
-    ------
-    ValueError
-        Naming the field, its value and what is allowed.
+    Raises ValueError, which names the field, its value and what is allowed.
     """
 
     lever_arm: tuple[float, float, float] | None = None
@@ -127,8 +120,8 @@ class Comparison:
         reading = self.mounting.apply(np.roll(motion.body.readings[self.kind], -lag, axis=0))
         return (motion.rate if self.kind in OF_TURNS else motion.vector)(reading)
 
-    def lag(self) -> tuple[float, float, bool]:
-        """Return by how many samples readings are late, its deviation, and whether it is sure."""
+    def lag(self) -> int:
+        """Return by how many samples readings are late, 0 where no other number is clear."""
         motions, residuals = [one for one, _ in self.motions], []
         lags = [lag for lag in LAGS if 4 * abs(lag) < min(len(one.rates) for one in motions)]
         for motion in motions:      # by all terms, of all axes: what else is wrong does not count
@@ -139,27 +132,13 @@ class Comparison:
             design /= np.maximum(np.linalg.norm(design, axis=0), 1e-300)
             read = np.hstack([self.read(motion, lag)[good] for lag in lags])
             residuals.append(read - design @ np.linalg.lstsq(design, read, rcond=1e-9)[0])
-        misfit = np.sum(np.concatenate(residuals) ** 2, axis=0).reshape(-1, 3).sum(axis=1)
-        best, now, count = int(np.argmin(misfit)), misfit[lags.index(0)], 3 * sum(
-            map(len, residuals))
-        width, size = motions[0].width, rms(self.sizes)
-        # Of smoothed samples fewer are independent: they must be more than the columns.
-        if (count < ENOUGH * 3 * width * design.shape[1] or best in (0, len(lags) - 1)
-                or now < count * (STILL * size) ** 2):
-            return math.nan, math.inf, False    # every lag explains it
-        # Around its minimum the sum of squares is a parabola.
-        sooner, least, later = misfit[best - 1:best + 2].tolist()
-        curvature = sooner - 2.0 * least + later
-        late = lags[best] + 0.5 * (sooner - later) / curvature
-        rest = max(least - 0.125 * (sooner - later) ** 2 / curvature, 0.0)
-        variance = rest / count * 2.0 * width   # of correlated noise
-        sigma, unlike = math.sqrt(2.0 * variance / curvature), (2.0 * SURE) ** 2 * variance
-        likely = np.abs(np.array(lags)[misfit - rest < unlike] - late)
-        sure = now - rest > unlike
-        if np.any(likely > 1.0 + 2.0 * SURE * sigma) or not (sure or abs(late) < 2.0 * sigma):
-            return math.nan, math.inf, False    # others, or none, explain it as well
-        return late, sigma, sure and (
-            rest < 0.25 * now or rest < 1.5 * count * (self.model(0).fit([]).noise * size) ** 2)
+        squares = np.mean(np.concatenate(residuals) ** 2, axis=0).reshape(-1, 3).mean(axis=1)
+        best, least = int(np.argmin(squares)), (EXACT * rms(self.sizes)) ** 2
+        # Of smoothed samples fewer are independent.
+        unlike = (2.0 * SURE) ** 2 * 2.0 * motions[0].width / (3 * sum(map(len, residuals)))
+        near = squares < squares[best] + unlike * max(squares[best], least)
+        alone = np.max(np.abs(np.flatnonzero(near) - best)) <= 1 and 0 < best < len(lags) - 1
+        return lags[best] if alone and squares[lags.index(0)] > least else 0
 
     def model(self, lag: int) -> Model:
         """Return what readings that are `lag` samples late may contain beside what is right."""
@@ -169,7 +148,9 @@ class Comparison:
             smooth = pair[0].smooth[keep]
             for motion, parts in zip(pair, (plain, noisy), strict=True):
                 effects = self.columns(motion)
-                effects[TARGET] = self.read(motion, lag) - effects['total']
+                read = self.read(motion, lag)
+                effects |= {TARGET: read - effects['total'], 'step': np.gradient(
+                    read if self.noisy else effects.get('whole', read), axis=0)}
                 parts.append({name: one[keep][smooth] / size for name, one in effects.items()})
         return Model(plain, noisy, self.always)
 
@@ -181,7 +162,7 @@ class Comparison:
             effects = {f'field {k}': motion.back @ axis for k, axis in enumerate(AXES)}
             effects['total'] = motion.back @ self.field
         else:
-            effects = {'rates': motion.rates, 'total': motion.rates}
+            effects = dict.fromkeys(('rates', 'total', 'whole'), motion.rates)
         total = effects['total']
         arms = self.always if self.kind == 'accelerations' else []
 
@@ -189,8 +170,7 @@ class Comparison:
             return self.mounting.apply(along(motion.turn, reading))
 
         effects |= {
-            'step': _per_step(effects.get('whole', total)), 'world': turned(total),
-            'reversed': turned(turned(total)),
+            'world': turned(total), 'reversed': turned(turned(total)),
             **{f'in world {arm}': turned(effects[arm]) for arm in arms},
             **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
         for of in ('total', *arms):
@@ -210,7 +190,7 @@ class Comparison:
             'total': gravity + (motion.acceleration if self.always else moved),
             'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.
-            'difference': along(motion.back, _per_step(along(motion.turn, moved))),
+            'difference': along(motion.back, np.gradient(along(motion.turn, moved), axis=0)),
             # A lever arm that is longer by 1 m along axes of the body, and a x r alone.
             **{f'arm {k}': second[:, :, k] for k in range(3)},
             **{f'turned arm {k}': 0.5 * (second - transposed)[:, :, k] for k in range(3)}}

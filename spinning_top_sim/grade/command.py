@@ -3,7 +3,6 @@
 Grade a recording: is this IMU that of this motion?  Of a top, is this motion right?
 
   spinning-top grade run.mcap                       # poses and readings of any body
-  spinning-top grade run.csv --lever-arm 0.1 0 0.2
   spinning-top grade run.csv --columns 't=stamp:ns, gx=gyro_x:deg/s, ...'
   spinning-top grade run.csv --scene looping        # also the motion of a top that is known
 

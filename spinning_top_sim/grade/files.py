@@ -19,10 +19,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from spinning_top_sim.grade.columns import LENGTHS, NORM, READINGS
+from spinning_top_sim.grade.columns import NORM, READINGS
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.table import Columns, read_columns
-from spinning_top_sim.times import stamp_text
+from spinning_top_sim.times import NEVER_NS, stamp_text
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.foreign_messages import PLACES, samples
@@ -32,7 +32,7 @@ from spinning_top_sim.tools.kinematics import Reals
 PARTS: dict[str, tuple[Sequence[str], Mapping[str, Any]]] = {
     't': (['t'], {'s': 10 ** 9, 'ms': 10 ** 6, 'us': 10 ** 3, 'ns': 1}),
     'attitudes': (['qx', 'qy', 'qz', 'qw'], {'1': 1.0}),
-    'positions': (['px', 'py', 'pz'], LENGTHS),
+    'positions': (['px', 'py', 'pz'], {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}),
     **{name: ([f'{letter}{axis}' for axis in 'xyz'], READINGS[name])
        for name, letter in zip(READINGS, 'gam', strict=True)}}
 UNITS = {name: units for names, units in PARTS.values() for name in names}
@@ -45,6 +45,7 @@ OF_TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
 TUM = ['timestamp', 'tx', 'ty', 'tz', *OF_TUM[4:]], [f'column {k}' for k in range(1, 9)]
 EUROC = {'timestamp': 't [ns]', **{f'{theirs}_{axis}': f'{ours}{axis}' for theirs, ours in (
     ('p_RS_R', 'p'), ('q_RS', 'q'), ('w_RS_S', 'g'), ('a_RS_S', 'a')) for axis in 'wxyz'}}
+OF_EUROC = 'state_groundtruth_estimate0/data.csv', 'imu0/data.csv'
 # Topics of this package that are graded where its log has them, the first of each kind.
 OURS = 'pose', 'ground_truth/odom', 'ground_truth/imu', 'imu/data_raw', 'imu/data', 'imu/mag'
 # Intervals of motions that can be graded [s]: others are those of times in another unit.
@@ -112,10 +113,12 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
         if is_log:
             unused = _add_log(recorded, path, topics)
         elif euroc:
-            for name in ('state_groundtruth_estimate0', 'imu0'):
-                table, rows = read_columns(euroc / name / 'data.csv')
+            for name in OF_EUROC:
+                table, rows = read_columns(euroc / name)
                 unused += _add(recorded, {EUROC.get(BRACKETS.sub('', column), column): cells
                                           for column, cells in table.items()}, rows, {})
+            unused += sorted({one.relative_to(euroc).as_posix() for one in euroc.glob('*/*.*')}
+                             .difference(OF_EUROC))
         else:
             table, rows = read_columns(path)
             if [*table] in TUM and path.suffix != '.csv' and not columns:
@@ -131,14 +134,15 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
                                  f'from {first:.6g} to {last:.6g} s: must be of one clock')
     except (ValueError, EOFError, csv.Error, BadZipFile) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error
-    if READINGS.keys().isdisjoint(recorded.parts):
-        recorded.notes.append('no readings: the IMU is not graded')
     return recorded
 
 
 def _add_log(recorded: Recorded, path: Path, wanted: Sequence[str]) -> list[str]:
     """Add the parts of a log; return what is not used.  Raises LogError or ValueError."""
-    ours, end_ns = list[str | None](), 1 << 63
+    ours, end_ns = list[str | None](), NEVER_NS
+    bag = path / 'metadata.yaml'
+    if bag.exists() and len({*re.findall(r'\S+\.mcap', bag.read_text('utf-8'))}) > 1:
+        raise ValueError('the bag has several files: make one of them by ros2 bag convert')
     with LogReader(path) as reader:
         with contextlib.suppress(recorded_run.ForeignLogError):
             run = recorded.run = recorded_run.read_run_description(reader)
@@ -153,7 +157,8 @@ def _add_log(recorded: Recorded, path: Path, wanted: Sequence[str]) -> list[str]
     sources = {name for every in found.values() for name in every}
     for name in {*wanted} - sources:
         raise ValueError(f'--topic {name}: the log has {", ".join(sorted(sources)) or "none"}')
-    groups = wanted, *([one] for one in ours), sources.copy()
+    many = {one for every in found.values() for one in every if len(every[one]) >= LEAST_SAMPLES}
+    groups = wanted, *([one] for one in ours), many, sources.copy()
     for kind, every in found.items():
         here = next(filter(None, ([name for name in every if name in group] for group in groups)))
         if len(here) > 1:
@@ -209,7 +214,7 @@ def _chosen(columns: Columns, said: Chosen, wanted: Sequence[str]) -> Chosen:
         units = dict.fromkeys(', '.join(UNITS[name]) for name in unclear)
         raise ValueError(f"say --columns '{', '.join(items)}', each UNIT one of "
                          f"{'; '.join(units)}; or leave a part out, such as 'ax=, ay=, az='; the "
-                         f'file has {", ".join(columns)}')
+                         f'file has {", ".join(columns) or "no columns"}')
     return chosen
 
 

@@ -69,18 +69,7 @@ class Start(State):
 
 @dataclass(frozen=True)
 class Scene:
-    """
-    A motion that is graded.
-
-    Parameters
-    ----------
-    name : str
-        Of the scene, in reports.
-    start : mapping
-        l3, lz, theta and theta_dot, those that are not 0.
-    duration : float
-        Length [s].
-    """
+    """A motion of a duration [s] that is graded; `start`: l3, lz, theta, theta_dot, or 0."""
 
     name: str
     start: Mapping[str, float]

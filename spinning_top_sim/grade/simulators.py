@@ -27,7 +27,7 @@ Simulate = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].
 TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
-WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
+RIGHT = 0.2             # share of their error that is left in the convention that they are in
 SAME = 0.1              # share of an error that another time leaves
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
@@ -132,9 +132,8 @@ class Judgement:
         solution = ExactSolution(self.body, start)
         truth = solution.states(told.t)
         q, exact = values['attitudes'], Rotation.from_quat(truth.quaternion)
-        found = conventions.best(q[:EARLY], truth.quaternion[:EARLY]) if np.max(
-            (exact.inv() * told.rotation).magnitude()[:EARLY]) > WRONG else None
-        if found and found.convention.parts and found.after < RIGHT * found.before:
+        found = conventions.best(q[:EARLY], truth.quaternion[:EARLY])
+        if found.convention.parts and found.after < RIGHT * found.before:
             self.faults.append(Finding('convention', f'{name}: attitudes are told as '
                                        f'{found.convention.name}; this is undone', found.before))
             told = undone(told, found.convention)

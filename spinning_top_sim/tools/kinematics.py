@@ -30,7 +30,7 @@ SIDE = 5                        # samples that a derivative needs on each side
 WIDTHS = 1, 3, 5, 9, 15, 25, 41, 65     # of kernels [samples]
 ORDER = 10                      # of the differences in which motions vanish and noise does not
 MEDIAN = 0.6745                 # of the absolute values of normal noise, in standard deviations
-GAP = 2.5                       # intervals that are a gap
+LOST, GAP = 1.5, 2.5            # intervals where a sample is missing, for differences; a gap
 EVEN = 1e-4                     # share of the interval by which stamps may be uneven
 DEGREE = 5                      # of the splines between samples
 LEAST = 60                      # samples of a stretch
@@ -198,9 +198,9 @@ def stretches(parts: Parts) -> tuple[list[Stretch], float]:
     intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in parts.items()}
     step, sigma, spans = max(intervals.values()), {}, [(-math.inf, math.inf)]
     for name, (at, rows) in parts.items():
-        gaps = np.flatnonzero(np.diff(at) > GAP * intervals[name])
-        pieces = [*zip([0, *gaps + 1], [*gaps + 1, len(at)], strict=True)]
-        squares = [(_noise(name, rows[a:b]) ** 2, b - a) for a, b in pieces if b - a > 2 * ORDER]
+        whole, pieces = ([*zip([0, *ends], [*ends, len(at)], strict=True)] for ends in (
+            1 + np.flatnonzero(np.diff(at) > most * intervals[name]) for most in (LOST, GAP)))
+        squares = [(_noise(name, rows[a:b]) ** 2, b - a) for a, b in whole if b - a > 2 * ORDER]
         sigma[name] = math.sqrt(sum(one * n for one, n in squares)
                                 / max(sum(n for _, n in squares), 1))
         spans = [(max(first, at[a]), min(last, at[b - 1])) for first, last in spans
