@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import NEES_OFF, USELESS_DEG, degrees
-from spinning_top_sim.exam.motions import FIELD, RATE, STEPS, Reals
+from spinning_top_sim.exam.motions import FIELD, RATE, STARTS, STEPS, Reals
 from spinning_top_sim.exam.runs import ANSWER, BACK, BIAS, LARGE, SMALL, STILL, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Errors, errors_of
@@ -163,23 +163,19 @@ def large_turns(exam: Exam) -> Measured:
 
 
 def tilt_answer(exam: Exam) -> Measured:
-    """Turn the gyroscope alone about each axis, and across it: gravity leads the tilt back."""
-    up, back = measures.up(exam.run.truth[exam.ends - 1]), []
-    for name, axis in zip(AXES, np.eye(3), strict=True):
-        k = np.argmin(np.abs(up @ axis))        # where it is most level
-        across, rows = np.cross(up[k], axis), np.array((exam.ends[k] - BACK, exam.ends[k] - 1))
-        for kick, how in ((np.cross(across, up[k]), 'about'), (across, 'across')):
-            moved = exam.outcome(f'tilt {how} {name}', exam.kicked(
-                rows[:1], SMALL * kick[np.newaxis]).part(slice(exam.ends[k])))
-            first, later = np.cross(measures.up(moved.estimates[rows]),
-                                    measures.up(exam.still.estimates[rows]))
+    """Turn the gyroscope alone about the level axes of new filters: gravity leads it back."""
+    back: Reals = np.empty((2, 2))
+    # Flat, and on edge.
+    for k, (axes, start) in enumerate((((0, 1), STARTS[0]), ((0, 2), (60.0, 2.0, 87.0)))):
+        *moved, still = (measures.up(one.estimates[[-BACK, -1]])
+                         for one in exam.kicks_of_tilt(start, axes))
+        for j, (first, later) in enumerate(np.cross(moved, still)):
             # `first` is 0 if the filter misses the kick.
-            back.append(1.0 - float(first @ later) / max(float(first @ first), STILL ** 2))
-    share = np.array(back[::2]) / np.maximum(back[1::2], measures.ROUNDING)
-    return Measured(1.0 - float(np.min(share)), 'gravity leads a tilt about x, y and z back by '
-                    f'{", ".join(f"{one:.2g}" for one in back[::2])} of it within '
-                    f'{BACK / RATE:g} s, across by '
-                    f'{", ".join(f"{one:.2g}" for one in back[1::2])}')
+            back[k, j] = 1.0 - float(first @ later) / max(float(first @ first), STILL ** 2)
+    share = back / np.maximum(back[:, ::-1], measures.ROUNDING)
+    return Measured(1.0 - float(np.min(share)), f'within {BACK / RATE:g} s gravity leads a tilt '
+                    'about x and y back by {:.2g} and {:.2g} of it, on edge about x and z by '
+                    '{:.2g} and {:.2g}'.format(*back.ravel()))
 
 
 def clean(exam: Exam) -> Measured:

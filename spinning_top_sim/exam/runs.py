@@ -154,6 +154,14 @@ class Exam:
         gyroscope[steps] += turns / dt[steps, np.newaxis]
         return replace(run, gyroscope=gyroscope, dt=dt)
 
+    def kicks_of_tilt(self, start: Sequence[float], axes: tuple[int, int]) -> list[Outcome]:
+        """Return new filters at rest with a kick about each of two axes, and without one."""
+        run = Motion(start).rest((self.lead + BACK) / RATE).run('tilt').without_field()
+        rates = np.repeat(run.gyroscope[np.newaxis], 3, axis=0)
+        rates[[0, 1], -BACK, axes] += SMALL * RATE
+        return self.outcomes(f'tilt {start}', lambda: [
+            replace(run, gyroscope=one) for one in rates])
+
     @cached_property
     def small_turns(self) -> tuple[Reals, Reals]:
         """The answers to SMALL kicks in equal steps."""
@@ -170,5 +178,8 @@ class Exam:
         steps, still = self.ends - ANSWER, self.still.estimates
         turns = measures.up(still[steps - 1]) * np.reshape(size * RATE * lengths, (-1, 1))
         moved = self.outcome(name, self.kicked(steps, turns, lengths)).estimates
+        if np.ndim(lengths):    # what drifts goes otherwise in such steps, without kicks, too
+            still = self.outcome(f'{name}, none', self.kicked(
+                steps, 0.0 * turns, lengths)).estimates
         apart = measures.increments(moved) - measures.increments(still)
         return turns, np.cumsum(apart[steps[:, np.newaxis] + np.arange(ANSWER)], axis=1)
