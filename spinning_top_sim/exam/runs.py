@@ -68,7 +68,10 @@ class Exam:
     def starts(self) -> list[Outcome]:
         """New filters at rest, until they are settled or the patience ends, as they are told."""
         for seconds in LEADS_S:
-            outcomes = self._feed([Motion(start).rest(seconds).run('start') for start in STARTS])
+            runs = [Motion(start).rest(seconds).run('start') for start in STARTS]
+            for run in runs:
+                run.gyroscope[-1] = 0.0         # some filters divide by the norm of the rates
+            outcomes = self._feed(runs)
             if all(measures.settled(one.estimates, STILL) for one in outcomes):
                 break
         return outcomes
@@ -176,7 +179,9 @@ class Exam:
         lengths : of the steps, one in the end of each rest [s]
         """
         steps, still = self.ends - ANSWER, self.still.estimates
-        turns = measures.up(still[steps - 1]) * np.reshape(size * RATE * lengths, (-1, 1))
+        # Of both signs: what grows with the square of a rate is then no matrix.
+        sizes = size * RATE * lengths * (-1.0) ** np.arange(len(steps))
+        turns = measures.up(still[steps - 1]) * sizes[:, np.newaxis]
         moved = self.outcome(name, self.kicked(steps, turns, lengths)).estimates
         if np.ndim(lengths):    # what drifts goes otherwise in such steps, without kicks, too
             still = self.outcome(f'{name}, none', self.kicked(
