@@ -93,7 +93,7 @@ def convention(exam: Exam) -> Measured:
 
 def gyroscope(exam: Exam) -> Measured:
     """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
-    turns, moves = exam.small_turns
+    turns, moves = exam.answers()
     matrix = np.linalg.lstsq(turns, moves[:, -1], rcond=None)[0].T
     left = float(np.median(np.linalg.norm(moves[:, -1] - turns @ matrix.T, axis=1)
                            / np.linalg.norm(turns, axis=1)))
@@ -112,7 +112,8 @@ def gyroscope(exam: Exam) -> Measured:
 
 def at_rest(exam: Exam) -> Measured:
     """Judge where new filters come to rest: no estimate of a bias explains an error there."""
-    tilt, whole = (_at_rest(exam.settled, slice(axes)) for axes in (2, 3))
+    settled = [exam.ours(one) for one in exam.starts if measures.settled(one.estimates, STILL)]
+    tilt, whole = (_at_rest(settled, slice(axes)) for axes in (2, 3))
     if tilt > CLEAN_DEG:        # by the field?
         tilt = min(tilt, _at_rest(exam.outcomes('starts, no field', lambda: [
             one.run.without_field() for one in exam.starts]), slice(2)))
@@ -125,7 +126,7 @@ def at_rest(exam: Exam) -> Measured:
 
 def delay(exam: Exam) -> Measured:
     """Identify the delay with which the attitude follows the gyroscope."""
-    off = 1.0 - np.median(_gains(*exam.small_turns), axis=0)
+    off = 1.0 - np.median(_gains(*exam.answers()), axis=0)
     off -= off[-1]
     late = float(np.sum(off))
     evidence = (f'the attitude follows the gyroscope {abs(late):.3g} samples '
@@ -139,13 +140,13 @@ def delay(exam: Exam) -> Measured:
 def steps(exam: Exam) -> Measured:
     """Compare turns in steps of different lengths: most of those of a length are misused."""
     lengths = np.resize(STEPS, len(exam.ends))
-    off = np.abs(1.0 - _gains(*exam.answers('uneven turns', SMALL, lengths))[:, 0])
+    off = np.abs(1.0 - _gains(*exam.answers(lengths=lengths))[:, 0])
     of_length = [float(np.median(off[lengths == length])) for length in STEPS]
     worst = int(np.argmax(of_length))
     evidence = (f'in steps of {1e3 * STEPS[worst]:g} ms {of_length[worst]:.3g} of a turn is not '
                 'as the gyroscope reads it')
     # As angles, those in equal steps are as much off if the length is not the cause.
-    equal = np.median(np.abs(1.0 - _gains(*exam.small_turns)[:, 0])) / (STEPS[worst] * RATE)
+    equal = np.median(np.abs(1.0 - _gains(*exam.answers())[:, 0])) / (STEPS[worst] * RATE)
     if equal > EXPLAINED * of_length[worst]:
         return Measured(of_length[worst], f'{evidence}, nor in equal steps', 'accuracy')
     return Measured(of_length[worst], f'{evidence}: the length is misused')
@@ -154,7 +155,7 @@ def steps(exam: Exam) -> Measured:
 def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with small ones: the closed form is the same for both."""
     large, small = (float(np.median(_gains(*answers)[:, 0]))
-                    for answers in (exam.answers('large turns', LARGE), exam.small_turns))
+                    for answers in (exam.answers(LARGE), exam.answers()))
     off = abs(1.0 - large / small)
     return Measured(off, f'a turn of {LARGE:g} rad in one step, {LARGE * RATE:g} rad/s, moves the '
                     f'attitude by {large:.4g} of it, a small one by {small:.4g}; a step of '
@@ -163,15 +164,15 @@ def large_turns(exam: Exam) -> Measured:
 
 
 def tilt_answer(exam: Exam) -> Measured:
-    """Turn the gyroscope alone about the level axes of new filters: gravity leads it back."""
-    back: Reals = np.empty((2, 2))
-    # Flat, and on edge.
+    """Turn the gyroscope about level axes of new filters, flat and on edge: gravity answers."""
+    back = np.empty((2, 2))
     for k, (axes, start) in enumerate((((0, 1), STARTS[0]), ((0, 2), (60.0, 2.0, 87.0)))):
         *moved, still = (measures.up(one.estimates[[-BACK, -1]])
                          for one in exam.kicks_of_tilt(start, axes))
-        for j, (first, later) in enumerate(np.cross(moved, still)):
-            # `first` is 0 if the filter misses the kick.
-            back[k, j] = 1.0 - float(first @ later) / max(float(first @ first), STILL ** 2)
+        first, later = np.cross(moved, still).transpose(1, 0, 2)
+        # `first` is 0 if the filter misses the kick.
+        back[k] = 1.0 - np.sum(first * later, axis=1) / np.maximum(
+            np.sum(first ** 2, axis=1), STILL ** 2)
     share = back / np.maximum(back[:, ::-1], measures.ROUNDING)
     return Measured(1.0 - float(np.min(share)), f'within {BACK / RATE:g} s gravity leads a tilt '
                     'about x and y back by {:.2g} and {:.2g} of it, on edge about x and z by '

@@ -13,8 +13,8 @@ from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import rms
 
 ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
-# Factors by which a covariance may be too small, and too large: that of a filter which is tuned for
-# accelerations of 1 m/s^2, where the noise is a hundredth of that.
+# Factors by which a covariance may be too small, and too large: filters are tuned for
+# accelerations, which are 1 m/s^2 where the noise is a hundredth of it.
 NEES_OFF = 4.0, 100.0
 USELESS_DEG = 10.0      # a larger error than that of any published filter with tuned gains
 
