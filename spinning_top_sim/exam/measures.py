@@ -59,11 +59,6 @@ def settled(quaternions: Reals, most: float) -> bool:
     return largest_turn(later[:1], later) < most
 
 
-def differ(one: Reals, other: Reals) -> bool:
-    """Return whether attitudes (n, 4) are others than these, beyond rounding."""
-    return largest_turn(one, other) > ROUNDING
-
-
 def degrees(angle: float) -> str:
     """Return an angle [rad] in words."""
     return f'{math.degrees(angle):.3g} deg'
@@ -73,9 +68,8 @@ def nees_of(outcomes: Sequence[Outcome]) -> float | None:
     """
     Return the normalised squared error of the tilt (Bar-Shalom et al. 2001, 5.4.2).
 
-    It is 1 if the covariance is consistent; below 1 it is that of the worse principal axis.  The
-    covariance may refer to the axes of the sensor or of the world: the better one counts.  None:
-    there is no covariance.
+    It is 1 if consistent, below 1 that of the worse principal axis.  The covariance may be about
+    the axes of the sensor or of the world: the better one counts.  None: there is no covariance.
     """
     squares = []
     for outcome in outcomes:

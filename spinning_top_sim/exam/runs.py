@@ -136,7 +136,8 @@ class Exam:
     @cached_property
     def heading(self) -> bool:
         """Whether the field changes attitudes: only then the heading is judged against north."""
-        return measures.differ(self.plain.estimates, self.still.estimates)
+        return measures.largest_turn(self.plain.estimates,
+                                     self.still.estimates) > measures.ROUNDING
 
     def errors(self, outcome: Outcome) -> Errors:
         """Return the errors of an outcome; without north, about their mean."""
@@ -148,8 +149,7 @@ class Exam:
         run = Motion(start).rest((self.lead + BACK) / RATE).run('tilt').without_field()
         rates = np.repeat(run.gyroscope[np.newaxis], 3, axis=0)
         rates[[0, 1], -BACK, axes] += SMALL * RATE
-        return self.outcomes(f'tilt {start}', lambda: [
-            replace(run, gyroscope=one) for one in rates])
+        return self.outcomes(str(start), lambda: [replace(run, gyroscope=one) for one in rates])
 
     def answers(self, size: float = SMALL,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
