@@ -20,7 +20,8 @@ from spinning_top_sim.tools.identify import AXES, Reals, rms
 # Directions of the axes x, y, z of worlds that programs use, in ours.
 _DIRECTIONS = {'east': (1, 0, 0), 'north': (0, 1, 0), 'up': (0, 0, 1),
                'west': (-1, 0, 0), 'south': (0, -1, 0), 'down': (0, 0, -1)}
-WORLDS = 'north-east-down', 'north-west-up', 'east-up-south', 'north-up-east', 'south-up-west'
+WORLDS = ('north-east-down', 'north-west-up', 'south-east-up', 'east-up-south', 'north-up-east',
+          'south-up-west')
 TURNS = Rotation.create_group('O')          # the 24 right-handed signed permutations
 # A simpler convention is preferred to one that leaves up to this factor, or angle [rad], less.
 AS_GOOD, SAME = 1.5, math.radians(0.1)
