@@ -81,10 +81,9 @@ def group() -> list[Convention]:
         if len(parts) <= MOST:
             found.append(Convention(w_first, conjugate, left.as_quat(), right.as_quat(), parts))
     # Other axes of world and sensor at once are another order or sign of the vector part.
-    for turn, w_first, conjugate in itertools.product(TURNS, (False, True), (False, True)):
-        matrix = turn.as_matrix() * (-1.0 if conjugate else 1.0)
-        parts = ('w, x, y, z',) * w_first + (f'vector part {axes(matrix)}',)
-        found.append(Convention(w_first, conjugate, turn.as_quat(), turn.inv().as_quat(), parts))
+    for turn, w_first, sign in itertools.product(TURNS, (False, True), (1.0, -1.0)):
+        parts = ('w, x, y, z',) * w_first + (f'vector part {axes(sign * turn.as_matrix())}',)
+        found.append(Convention(w_first, sign < 0.0, turn.as_quat(), turn.inv().as_quat(), parts))
     return sorted(found, key=lambda one: len(one.parts))
 
 
