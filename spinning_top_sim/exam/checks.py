@@ -32,7 +32,7 @@ GAIN_OFF = 0.02         # of what should be 1: less than sensors differ in scale
 EXPLAINED = 0.25        # of an effect: what its cause may leave of it
 DELAY = 0.25            # samples: half of what a mean of two steps is late
 # Of shares that are 1 where a filter ignores gravity about an axis, or all but the force; right
-# ones that weigh both have up to 0.25, 0.75.
+# ones that weigh both have up to 0.8.
 IGNORES = 0.9
 # Of large turns: half of what a step of first order, 2 atan(x / 2), misses.
 TURNS_OFF = LARGE ** 2 / 24.0
