@@ -46,7 +46,7 @@ def test_without_errors_the_readings_are_those_of_the_motion(perfect, name):
     size = np.sqrt(np.mean(acceleration ** 2))
     assert np.max(np.abs(np.mean(acceleration, axis=0))) < 0.02 * size
     assert turns.apply(run.magnetometer) == pytest.approx(np.broadcast_to(
-        field.DEVICE['mag.field'], (len(run.t), 3)), abs=1e-12)
+        field.DEVICE['mag.field'], (len(run.dt), 3)), abs=1e-12)
 
 
 def test_a_scene_depends_on_its_seed_alone():

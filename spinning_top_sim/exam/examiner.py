@@ -159,7 +159,8 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], Scored]], kin
                 part = run.part(slice(1000))        # shows whether it uses the field
                 one, other = feed(make_filter, [part, replace(
                     part, magnetometer=part.magnetometer[:, [1, 2, 0]])])
-                whole = measures.differ(one.estimates, other.estimates)
+                whole = measures.largest_turn(one.estimates,
+                                              other.estimates) > measures.ROUNDING
             outcomes.append(feed(make_filter, [run])[0].part(counts))
         except InvalidOutputError as error:
             failed.append(str(error))

@@ -13,7 +13,9 @@ from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import rms
 
 ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
-NEES_OFF = 4.0, 20.0    # factors by which a covariance may be too small, and on the safe side
+# Factors by which a covariance may be too small, and too large: those tuned for accelerations are
+# some 100, degrees instead of radians 3283.
+NEES_OFF = 4.0, 1000.0
 USELESS_DEG = 10.0      # a larger error than that of any published filter with tuned gains
 
 
@@ -57,11 +59,6 @@ def settled(quaternions: Reals, most: float) -> bool:
     return largest_turn(later[:1], later) < most
 
 
-def differ(one: Reals, other: Reals) -> bool:
-    """Return whether attitudes (n, 4) are others than these, beyond rounding."""
-    return largest_turn(one, other) > ROUNDING
-
-
 def degrees(angle: float) -> str:
     """Return an angle [rad] in words."""
     return f'{math.degrees(angle):.3g} deg'
@@ -71,21 +68,24 @@ def nees_of(outcomes: Sequence[Outcome]) -> float | None:
     """
     Return the normalised squared error of the tilt (Bar-Shalom et al. 2001, 5.4.2).
 
-    It is 1 if the covariance is consistent.  The covariance may refer to the axes of the sensor or
-    of the world: the better one counts.  None: there is no covariance.
+    It is 1 if consistent, below 1 that of the worse principal axis.  The covariance may be about
+    the axes of the sensor or of the world: the better one counts.  None: there is no covariance.
     """
     squares = []
     for outcome in outcomes:
         one = outcome.part(np.flatnonzero(np.isfinite(outcome.covariances[:, 0, 0])))
         if not len(one.run.dt):
             return None
-        tilt = turns(one.estimates, one.run.truth)[:, :2]
         turn = Rotation.from_quat(one.estimates).as_matrix()
-        squares.append([np.einsum('ni,nij,nj->n', tilt, np.linalg.pinv(
-            p[:, :2, :2], hermitian=True), tilt) for p in (
-                one.covariances, turn @ one.covariances @ turn.transpose(0, 2, 1))])
-    means = np.maximum(0.5 * np.mean(np.concatenate(squares, axis=1), axis=1), ROUNDING)
-    return float(min(means, key=lambda ratio: abs(math.log(ratio))))
+        variances, axes = np.linalg.eigh(np.stack((
+            one.covariances, turn @ one.covariances @ turn.transpose(0, 2, 1)))[..., :2, :2])
+        tilt = np.einsum('ni,fnij->fnj', turns(one.estimates, one.run.truth)[:, :2], axes)
+        least = ROUNDING ** 2 * np.trace(one.covariances, axis1=1, axis2=2)[:, np.newaxis]
+        squares.append(tilt ** 2 / np.maximum(variances, least))
+    means = np.maximum(np.mean(np.concatenate(squares, axis=1), axis=1), ROUNDING)
+    both, least = np.mean(means, axis=1), np.min(means, axis=1)
+    return float(min(np.where(both * least > 1.0, both, least),
+                     key=lambda ratio: abs(math.log(ratio))))
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

@@ -66,11 +66,6 @@ class Run:
     accelerometer: Reals    # (n, 3) [m/s^2]
     magnetometer: Reals     # (n, 3) [T], NaN: there is none
 
-    @property
-    def t(self) -> Reals:
-        """Times since the begin of the first step (n,) [s]."""
-        return np.cumsum(self.dt)
-
     def part(self, rows: slice | NDArray[np.intp]) -> 'Run':
         """Return the run at these times only."""
         return Run(self.name, *(getattr(self, one.name)[rows] for one in fields(self)[1:]))

@@ -35,8 +35,9 @@ def draw_page(report: Report, path: Path) -> None:
             for outcome in report.outcomes:
                 errors = errors_of(outcome.estimates, outcome.run.truth)
                 error = getattr(errors if report.absolute else errors.about_mean(), name)
-                axes.semilogy(outcome.run.t, np.maximum(np.degrees(np.abs(error)), LEAST_DEG),
-                              linewidth=0.8, label=outcome.run.name)
+                error = np.maximum(np.degrees(np.abs(error)), LEAST_DEG)
+                axes.semilogy(np.cumsum(outcome.run.dt), error, linewidth=0.8,
+                              label=outcome.run.name)
             axes.axhline(limit, color='0.5', linestyle=':', label='limit of the rms')
             axes.set(ylabel=f'{name} error [deg]', xlabel='time that is judged [s]')
             axes.yaxis.set_major_formatter('{x:g}')         # the default is TeX

@@ -68,15 +68,13 @@ class Exam:
     def starts(self) -> list[Outcome]:
         """New filters at rest, until they are settled or the patience ends, as they are told."""
         for seconds in LEADS_S:
-            outcomes = self._feed([Motion(start).rest(seconds).run('start') for start in STARTS])
+            runs = [Motion(start).rest(seconds).run('start') for start in STARTS]
+            for run in runs:
+                run.gyroscope[-1] = 0.0         # some filters divide by the norm of the rates
+            outcomes = self._feed(runs)
             if all(measures.settled(one.estimates, STILL) for one in outcomes):
                 break
         return outcomes
-
-    @property
-    def settled(self) -> list[Outcome]:
-        """Those of the new filters that have settled, in our convention."""
-        return [self.ours(one) for one in self.starts if measures.settled(one.estimates, STILL)]
 
     @cached_property
     def lead(self) -> int:
@@ -138,28 +136,22 @@ class Exam:
     @cached_property
     def heading(self) -> bool:
         """Whether the field changes attitudes: only then the heading is judged against north."""
-        return measures.differ(self.plain.estimates, self.still.estimates)
+        return measures.largest_turn(self.plain.estimates,
+                                     self.still.estimates) > measures.ROUNDING
 
     def errors(self, outcome: Outcome) -> Errors:
         """Return the errors of an outcome; without north, about their mean."""
         errors = errors_of(outcome.estimates, outcome.run.truth)
         return errors if self.heading else errors.about_mean()
 
-    def kicked(self, steps: NDArray[np.intp], turns: Reals,
-               lengths: Reals | float = 1.0 / RATE) -> Run:
-        """Return the run without field, with kicks (n, 3) [rad] in steps of these lengths [s]."""
-        run = self.run.without_field()
-        gyroscope, dt = run.gyroscope.copy(), run.dt.copy()
-        dt[steps] = lengths
-        gyroscope[steps] += turns / dt[steps, np.newaxis]
-        return replace(run, gyroscope=gyroscope, dt=dt)
+    def kicks_of_tilt(self, start: Sequence[float], axes: tuple[int, int]) -> list[Outcome]:
+        """Return new filters at rest with a kick about each of two axes, and without one."""
+        run = Motion(start).rest((self.lead + BACK) / RATE).run('tilt').without_field()
+        rates = np.repeat(run.gyroscope[np.newaxis], 3, axis=0)
+        rates[[0, 1], -BACK, axes] += SMALL * RATE
+        return self.outcomes(str(start), lambda: [replace(run, gyroscope=one) for one in rates])
 
-    @cached_property
-    def small_turns(self) -> tuple[Reals, Reals]:
-        """The answers to SMALL kicks in equal steps."""
-        return self.answers('turns', SMALL)
-
-    def answers(self, name: str, size: float,
+    def answers(self, size: float = SMALL,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
         """
         Return kicks about the vertical (n, 3), and how they move attitudes (n, ANSWER, 3).
@@ -167,8 +159,17 @@ class Exam:
         size : of a kick in a step of 1 / RATE [rad]; in other steps it is as fast
         lengths : of the steps, one in the end of each rest [s]
         """
-        steps, still = self.ends - ANSWER, self.still.estimates
-        turns = measures.up(still[steps - 1]) * np.reshape(size * RATE * lengths, (-1, 1))
-        moved = self.outcome(name, self.kicked(steps, turns, lengths)).estimates
+        steps, still, run = self.ends - ANSWER, self.still.estimates, self.run.without_field()
+        gyroscope, dt = run.gyroscope.copy(), run.dt.copy()
+        dt[steps] = lengths
+        # Of both signs: what grows with the square of a rate is then no matrix.
+        sizes = size * RATE * dt[steps] * (-1.0) ** np.arange(len(steps))
+        turns = measures.up(still[steps - 1]) * sizes[:, np.newaxis]
+        gyroscope[steps] += turns / dt[steps, np.newaxis]
+        uneven = ', uneven steps' * np.ndim(lengths)
+        moved = self.outcome(f'turns of {size:g} rad{uneven}', replace(
+            run, gyroscope=gyroscope, dt=dt)).estimates
+        if uneven:              # what drifts does so in such steps without kicks, too
+            still = self.outcome(f'no turns{uneven}', replace(run, dt=dt)).estimates
         apart = measures.increments(moved) - measures.increments(still)
         return turns, np.cumsum(apart[steps[:, np.newaxis] + np.arange(ANSWER)], axis=1)

@@ -20,7 +20,8 @@ from spinning_top_sim.tools.identify import AXES, Reals, rms
 # Directions of the axes x, y, z of worlds that programs use, in ours.
 _DIRECTIONS = {'east': (1, 0, 0), 'north': (0, 1, 0), 'up': (0, 0, 1),
                'west': (-1, 0, 0), 'south': (0, -1, 0), 'down': (0, 0, -1)}
-WORLDS = 'north-east-down', 'north-west-up', 'east-up-south', 'north-up-east', 'south-up-west'
+WORLDS = ('north-east-down', 'north-west-up', 'south-east-up', 'east-up-south', 'north-up-east',
+          'south-up-west')
 TURNS = Rotation.create_group('O')          # the 24 right-handed signed permutations
 # A simpler convention is preferred to one that leaves up to this factor, or angle [rad], less.
 AS_GOOD, SAME = 1.5, math.radians(0.1)
@@ -80,10 +81,9 @@ def group() -> list[Convention]:
         if len(parts) <= MOST:
             found.append(Convention(w_first, conjugate, left.as_quat(), right.as_quat(), parts))
     # Other axes of world and sensor at once are another order or sign of the vector part.
-    for turn, w_first, conjugate in itertools.product(TURNS, (False, True), (False, True)):
-        matrix = turn.as_matrix() * (-1.0 if conjugate else 1.0)
-        parts = ('w, x, y, z',) * w_first + (f'vector part {axes(matrix)}',)
-        found.append(Convention(w_first, conjugate, turn.as_quat(), turn.inv().as_quat(), parts))
+    for turn, w_first, sign in itertools.product(TURNS, (False, True), (1.0, -1.0)):
+        parts = ('w, x, y, z',) * w_first + (f'vector part {axes(sign * turn.as_matrix())}',)
+        found.append(Convention(w_first, sign < 0.0, turn.as_quat(), turn.inv().as_quat(), parts))
     return sorted(found, key=lambda one: len(one.parts))
 
 

@@ -158,6 +158,6 @@ WRONG = {
     'bias negated': (partial(Part, report=np.negative), 'bias'),
     'bias in the world': (partial(Mahony, 0.5, 0.5, 0.05, in_world=True), 'bias'),
     'covariance / 16': (partial(Part, ReferenceFilter, covariance=1.0 / 16.0), 'covariance'),
-    'covariance x 50': (partial(Part, ReferenceFilter, covariance=50.0), 'covariance'),
+    'covariance in deg^2': (partial(Part, ReferenceFilter, covariance=3283.0), 'covariance'),
     'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
 TABLE = {**{name: (make, '') for name, make in RIGHT.items()}, **WRONG}
