@@ -2,6 +2,7 @@
 """The exam of a ROS node: in lockstep, sample by sample."""
 
 import importlib
+import itertools
 import os
 import signal
 import subprocess
@@ -20,18 +21,20 @@ pytest.importorskip('rclpy')
 pytest.importorskip('vqf')
 live = importlib.import_module('spinning_top_sim.exam.live')
 NODE = f'{sys.executable} {ROOT / "examples/attitude_node.py"}'
-# A node that answers each sample with the identity, as best it can.
+# A node that answers each sample with the parity of its number, as best it can.
 PLAIN = """
 import sys, rclpy
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Imu, Temperature
 rclpy.init()
 node = rclpy.create_node('plain')
 publisher = node.create_publisher(Imu, 'imu/data', qos_profile_sensor_data)
+node.create_publisher(Temperature, 'imu/temperature', 1)
 count = 0
 def take(message):
     global count
     count += 1
+    message.orientation.x, message.orientation.w = count % 2.0, 1.0 - count % 2.0
     if count not in LEFT_OUT:
         publisher.publish(message)
 node.create_subscription(Imu, 'imu/data_raw', take, qos_profile_sensor_data)
@@ -74,6 +77,21 @@ def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plai
         feeding.feed(node.start, [run])
 
 
+def test_a_start_whose_first_answer_is_lost_is_repeated(run, plain, monkeypatch):
+    # The node has used the sample, which it may get no second time.
+    lost, take = {len(run.dt)}, live.NodeExam._take
+    numbers = itertools.count()
+    monkeypatch.setattr(live.NodeExam, '_take', lambda node, message: (
+        None if next(numbers) in lost else take(node, message)))
+    with live.NodeExam(plain(), 'imu/data') as node:
+        one, same = feeding.feed(node.start, [run, run])
+        assert np.array_equal(one.estimates, same.estimates)
+    lost.add(next(numbers) + 1)                     # now in the first start: no verdict
+    with (live.NodeExam(plain(), 'imu/data') as node,
+          pytest.raises(feeding.NodeError, match='sample 2 first, and another one sample 1: a')):
+        feeding.feed(node.start, [run, run])
+
+
 def test_another_publisher_is_told_whenever_it_comes(run, monkeypatch):
     monkeypatch.setattr(live, 'READ_EVERY', 1)
     with live.NodeExam(NODE, 'imu/data') as node:
@@ -100,6 +118,10 @@ def children(pid):
 
 
 def test_the_node_ends_with_the_exam():
+    with pytest.raises(KeyboardInterrupt), live.NodeExam('true', 'imu/data') as interrupted:
+        signal.raise_signal(signal.SIGTERM)         # raises nothing within a call of rclpy
+        with pytest.raises(KeyboardInterrupt):
+            interrupted.start()
     exam = subprocess.Popen([sys.executable, '-m', 'spinning_top_sim', 'examine', '--node', NODE,
                              '--topic', 'imu/data'], stderr=subprocess.PIPE, cwd=ROOT, text=True,
                             env={**os.environ, 'PYTHONPATH': str(ROOT)})
@@ -123,8 +145,11 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
     with live.NodeExam(plain(left_out=range(99)), 'imu/data') as node:
         filter_ = node.start()
         monkeypatch.setattr(live, 'PATIENCE_S', 1.0)
-        with pytest.raises(RuntimeError, match='answers no sample within 1 s: must be'):
+        with pytest.raises(RuntimeError, match='answers none of 3 samples: an attitude must'):
             filter_.update(run.gyroscope[0], run.accelerometer[0], None, 0.01)
+    with (live.NodeExam(plain(), 'imu/temperature') as node, pytest.raises(
+            feeding.NodeError, match='imu/temperature is sensor_msgs/msg/Temperature: must be')):
+        node.start()
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
         feeding.feed(node.start, [run])
