@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,8 +80,7 @@ def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plai
 
 def test_a_start_whose_first_answer_is_lost_is_repeated(run, plain, monkeypatch):
     # The node has used the sample, which it may get no second time.
-    lost, take = {len(run.dt)}, live.NodeExam._take
-    numbers = itertools.count()
+    lost, take, numbers = {len(run.dt)}, live.NodeExam._take, itertools.count()
     monkeypatch.setattr(live.NodeExam, '_take', lambda node, message: (
         None if next(numbers) in lost else take(node, message)))
     with live.NodeExam(plain(), 'imu/data') as node:
@@ -99,22 +99,9 @@ def test_another_publisher_is_told_whenever_it_comes(run, monkeypatch):
         readings = run.gyroscope[0], run.accelerometer[0], run.magnetometer[0], 0.01
         for _ in range(3):
             filter_.update(*readings)
-        other = subprocess.Popen([sys.executable, '-c', (
-            "import rclpy; from sensor_msgs.msg import Imu; rclpy.init(); "
-            "node = rclpy.create_node('other'); p = node.create_publisher(Imu, 'imu/data_raw', 1);"
-            ' rclpy.spin(node)')])
-        try:
-            with pytest.raises(feeding.NodeError, match='data_raw has 2 publishers: end the'):
-                wait_for('the other node', lambda: filter_.update(*readings) is None)
-        finally:
-            other.kill()
-            other.wait()
-
-
-def children(pid):
-    said = subprocess.run(['ps', '-o', 'pid=', '--ppid', str(pid)], capture_output=True, text=True,
-                          check=False).stdout.split()
-    return [int(one) for one in said]
+        node._node.create_publisher(live.Imu, live.IMU_TOPIC, 1)
+        with pytest.raises(feeding.NodeError, match='data_raw has 2 publishers: end the'):
+            wait_for('the graph', lambda: filter_.update(*readings) is None)
 
 
 def test_the_node_ends_with_the_exam():
@@ -126,8 +113,9 @@ def test_the_node_ends_with_the_exam():
                              '--topic', 'imu/data'], stderr=subprocess.PIPE, cwd=ROOT, text=True,
                             env={**os.environ, 'PYTHONPATH': str(ROOT)})
     try:
-        wait_for('the node to start', lambda: children(exam.pid))
-        node = children(exam.pid)
+        children = Path(f'/proc/{exam.pid}/task/{exam.pid}/children')
+        wait_for('the node to start', children.read_text)
+        node = children.read_text().split()
         exam.send_signal(signal.SIGTERM)
         _, said = exam.communicate(timeout=120.0)    # its end is that of the node, too
         assert exam.returncode == 130 and 'interrupted' in said

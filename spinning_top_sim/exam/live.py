@@ -17,7 +17,6 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
@@ -74,8 +73,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                     number, lambda number, _: self._interrupts.append(number))
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node(NAME, context=self._context, parameter_overrides=[
-            Parameter('use_sim_time', value=False)])
+        self._node = Node(NAME, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         # A reliable publisher that keeps messages serves readers of every kind.
