@@ -16,7 +16,6 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
@@ -73,7 +72,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                     number, lambda number, _: self._interrupts.append(number))
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node(NAME, context=self._context)
+        self._node = rclpy.create_node(NAME, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         # A reliable publisher that keeps messages serves readers of every kind.
@@ -82,7 +81,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             self._node.create_publisher(kind, name, profile)
             for kind, name in ((Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
         self._subscription: Any = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Any = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
         self._first = 0                             # the sample that a new node answers first
         self.covariance: Reals | None = None
@@ -99,7 +98,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     def start(self) -> 'NodeExam':
         """Start the node anew; return it as a filter."""
-        if self._process is not None:
+        if self._process:
             self._end_process()
             # Its endpoints leave the graph, so that they are not taken for the next node's.
             self._wait(lambda: not (self._imu.get_subscription_count()
@@ -114,15 +113,15 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                 f'no node reads {IMU_TOPIC} and publishes {self._topic} within {PATIENCE_S:g} s: '
                 f'check its ROS_DOMAIN_ID ({os.environ.get("ROS_DOMAIN_ID", "0")} here), '
                 'namespace and remappings')
-        self._check_alone()
-        for publisher in self._node.get_publishers_info_by_topic(self._topic):
-            if publisher.topic_type != IMU:
-                raise NodeError(f'{self._topic} is {publisher.topic_type}: must be {IMU}')
         # The attitudes are read with the reliability that they are offered with.
         self._subscription = self._subscription or self._node.create_subscription(
             Imu, self._topic, self._take,
             QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_AVAILABLE))
         self._wait(lambda: False, AGAIN_S)
+        self._check_alone()
+        for publisher in self._node.get_publishers_info_by_topic(self._topic):
+            if publisher.topic_type != IMU:
+                raise NodeError(f'{self._topic} is {publisher.topic_type}: must be {IMU}')
         self._now_ns, self._answered = START_NS, 0
         self._answers.clear()
         self.covariance = None
@@ -132,8 +131,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Raise NodeError if another node publishes on a topic of the exam."""
         for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
             if (count := self._node.count_publishers(name)) > 1:
-                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
-                                'needs the topic alone')
+                raise NodeError(f'{name} has {count} publishers: end the others')
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
@@ -156,18 +154,14 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         return np.array((q.x, q.y, q.z, q.w))
 
     def _begin(self, publish: Callable[[float], bool]) -> None:
-        """
-        Publish the first readings, again and later, until there is an answer.
-
-        A node may have no step to take at first.  Or it has taken one, and the answer is lost; so
-        all starts must need as many samples, and one that needs more is repeated.
-        """
+        """Publish the first readings, again and later, until there is an answer."""
+        # A node may have no step to take at first.  Or it has taken one and the answer is lost; so
+        # all starts must need as many samples, and one that needs more is repeated.
         tries = round(PATIENCE_S / AGAIN_S)
         for _ in range(5):
             sent = next((k for k in range(1, tries + 1) if publish(
                 ANSWER_S if k == (self._first or 1) else AGAIN_S)), 0)
             if not sent:
-                self._check_alone()
                 raise RuntimeError(f'it answers none of {tries} samples: an attitude must have '
                                    'the stamp of its sample')
             self._first = self._first or sent
@@ -206,7 +200,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                 raise KeyboardInterrupt
             if time.monotonic() > end:
                 return False
-            if self._process is not None and self._process.poll() is not None:
+            if self._process and self._process.poll() is not None:
                 raise RuntimeError(f'the node has ended with {self._process.returncode}')
             self._executor.spin_once(timeout_sec=0.05)
         return True
@@ -217,9 +211,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     def _end_process(self) -> None:
         process, self._process = self._process, None
-        if process is None:
-            return
-        for number in (signal.SIGINT, signal.SIGKILL):
+        for number in (signal.SIGINT, signal.SIGKILL) if process else ():
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(process.pid, number)
                 process.wait(ANSWER_S)
