@@ -169,8 +169,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                 break
             self.start()
         if sent != self._first:
-            raise NodeError(f'one start answers sample {self._first} first, and another one '
-                            f'sample {sent}: {self._lost}')
+            raise NodeError(f'starts answer sample {self._first} or {sent} first: {self._lost}')
 
     def _publish(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                  dt: float, seconds: float) -> bool:
