@@ -94,7 +94,7 @@ def test_a_filter_that_fails_in_a_trial_is_told(folder):
     ({'opt_quat': np.full((400, 4), np.nan)}, 'and movement with opt_quat'),
     ({'imu_gyr': np.full((400, 3), np.nan)}, 'finite readings'),
     ({'imu_acc': np.zeros(7)}, 'a.mat is no trial of BROAD: cannot reshape'),
-    (None, 'a.mat is no trial of BROAD: '), ('', 'has no trial: must have files .mat')])
+    (None, 'a.mat is no trial of BROAD: '), ('', 'must be a folder with trials of BROAD')])
 def test_what_is_no_trial_is_told_in_one_line(trial, tmp_path, capsys, change, says):
     if change:
         savemat(tmp_path / 'a.mat', {**trial, **change})

@@ -20,11 +20,9 @@ COLUMNS = {'imu_gyr': 3, 'imu_acc': 3, 'imu_mag': 3, 'opt_quat': 4, 'movement': 
 
 def trials_in(folder: str | Path) -> list[Path]:
     """Return the files of trials in a folder, by name.  Raises ValueError if there is none."""
-    if not Path(folder).is_dir():
-        raise ValueError(f'{folder}: must be a folder with trials of BROAD')
-    paths = sorted(path for path in Path(folder).iterdir() if path.suffix == '.mat')
+    paths = sorted(Path(folder).glob('*.mat'))
     if not paths:
-        raise ValueError(f'{folder} has no trial: must have files .mat')
+        raise ValueError(f'{folder}: must be a folder with trials of BROAD (.mat)')
     return paths
 
 

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--command', metavar='COMMAND', help='examine a program in any language: it reads a line '
         'of readings for each update and answers with a line; each run starts it anew')
     add('--node', metavar='COMMAND', help='command that starts a ROS node that reads imu/data_raw '
-        'and imu/mag; each run starts it anew, and waits for its answer to each sample')
+        'and imu/mag; each run starts it anew, and waits for its answer to each sample: minutes')
     add = parser.add_argument
     add('--topic', help='topic of the attitudes in a log, or of the node')
     add('--truth', help='topic of the true attitudes of the same axes; default: ground_truth/imu')

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,6 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
@@ -30,9 +29,9 @@ from spinning_top_sim.tools.report import Report
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start, and to answer first
-AGAIN_S = 0.3                   # after it, the first sample is sent again
+AGAIN_S = 0.3                   # for a node to find topics; then the first sample is sent again
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
-NAME, FRAME = 'examine', 'imu_link'
+NAME, FRAME, IMU = 'examine', 'imu_link', 'sensor_msgs/msg/Imu'
 
 
 def examine_node(command: str, topic: str, **options: Any) -> Report:
@@ -63,10 +62,17 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     def __init__(self, command: str, topic: str) -> None:
         expand_topic_name(topic, NAME, '/')         # raises ValueError
         self._command, self._topic = shlex.split(command), topic
+        self._lost = f'a message is lost; make {IMU_TOPIC} and {topic} reliable there'
+        # Raised within a call of rclpy, KeyboardInterrupt would leave it as another error.
+        self._interrupts: list[int] = []
+        self._handlers: dict[int, Any] = {}
+        with contextlib.suppress(ValueError):       # not in the main thread
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(
+                    number, lambda number, _: self._interrupts.append(number))
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node(NAME, context=self._context, parameter_overrides=[
-            Parameter('use_sim_time', value=False)])
+        self._node = rclpy.create_node(NAME, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         # A reliable publisher that keeps messages serves readers of every kind.
@@ -75,8 +81,9 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             self._node.create_publisher(kind, name, profile)
             for kind, name in ((Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
         self._subscription: Any = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Any = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
+        self._first = 0                             # the sample that a new node answers first
         self.covariance: Reals | None = None
 
     def __exit__(self, *exception: object) -> None:
@@ -84,10 +91,18 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        if self._interrupts:
+            raise KeyboardInterrupt
 
     def start(self) -> 'NodeExam':
         """Start the node anew; return it as a filter."""
-        self._end_process()
+        if self._process:
+            self._end_process()
+            # Its endpoints leave the graph, so that they are not taken for the next node's.
+            self._wait(lambda: not (self._imu.get_subscription_count()
+                                    or self._node.count_publishers(self._topic)), PATIENCE_S)
         try:
             self._process = subprocess.Popen(self._command, start_new_session=True)
         except OSError as error:
@@ -102,8 +117,12 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._subscription = self._subscription or self._node.create_subscription(
             Imu, self._topic, self._take,
             QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_AVAILABLE))
-        self._now_ns, self._answered = START_NS, 0
+        self._wait(lambda: False, AGAIN_S)
         self._check_alone()
+        for publisher in self._node.get_publishers_info_by_topic(self._topic):
+            if publisher.topic_type != IMU:
+                raise NodeError(f'{self._topic} is {publisher.topic_type}: must be {IMU}')
+        self._now_ns, self._answered = START_NS, 0
         self._answers.clear()
         self.covariance = None
         return self
@@ -112,30 +131,18 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Raise NodeError if another node publishes on a topic of the exam."""
         for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
             if (count := self._node.count_publishers(name)) > 1:
-                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
-                                'needs the topic alone')
+                raise NodeError(f'{name} has {count} publishers: end the others')
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """
-        Publish the readings, and wait for the attitude with their stamp.
-
-        The first ones are published again, later, until there is an answer: the node may not yet
-        be matched, or have no step to take.
-        """
-        for _ in range(1 if self._answered else round(PATIENCE_S / AGAIN_S)):
-            self._publish(gyroscope, accelerometer, magnetometer, dt)
-            if self._wait(lambda: self._now_ns in self._answers,
-                          ANSWER_S if self._answered else AGAIN_S):
-                break
-        else:
+        """Publish the readings, and wait for the attitude with their stamp."""
+        publish = partial(self._publish, gyroscope, accelerometer, magnetometer, dt)
+        if not self._answered:
+            self._begin(publish)
+        elif not publish(ANSWER_S):
             self._check_alone()
-            if not self._answered:
-                raise RuntimeError(f'it answers no sample within {PATIENCE_S:g} s: must be a '
-                                   'sensor_msgs/msg/Imu with the stamp of the sample')
             raise NodeError(f'no attitude has the stamp {stamp_text(self._now_ns)} s of its '
-                            f'sample within {ANSWER_S:g} s: the node hangs, or a message is lost; '
-                            f'make {IMU_TOPIC} and {self._topic} reliable there')
+                            f'sample within {ANSWER_S:g} s: the node hangs, or {self._lost}')
         message = self._answers.pop(self._now_ns)
         self._answers.clear()
         self._answered += 1
@@ -146,9 +153,27 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         q = message.orientation
         return np.array((q.x, q.y, q.z, q.w))
 
+    def _begin(self, publish: Callable[[float], bool]) -> None:
+        """Publish the first readings, again and later, until there is an answer."""
+        # A node may have no step to take at first.  Or it has taken one and the answer is lost; so
+        # all starts must need as many samples, and one that needs more is repeated.
+        tries = round(PATIENCE_S / AGAIN_S)
+        for _ in range(5):
+            sent = next((k for k in range(1, tries + 1) if publish(
+                ANSWER_S if k == (self._first or 1) else AGAIN_S)), 0)
+            if not sent:
+                raise RuntimeError(f'it answers none of {tries} samples: an attitude must have '
+                                   'the stamp of its sample')
+            self._first = self._first or sent
+            if sent <= self._first:
+                break
+            self.start()
+        if sent != self._first:
+            raise NodeError(f'starts answer sample {self._first} or {sent} first: {self._lost}')
+
     def _publish(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
-                 dt: float) -> None:
-        """Publish the readings of the next step."""
+                 dt: float, seconds: float) -> bool:
+        """Publish the readings of the next step; return whether there is an answer in time."""
         self._now_ns += round(dt * NANOSECONDS)
         clock, imu = Clock(), Imu()
         clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
@@ -164,14 +189,17 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         if magnetometer is not None:
             self._field.publish(field)
         self._imu.publish(imu)
+        return self._wait(lambda: self._now_ns in self._answers, seconds)
 
     def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""
         end = time.monotonic() + seconds
         while not condition():
+            if self._interrupts:
+                raise KeyboardInterrupt
             if time.monotonic() > end:
                 return False
-            if self._process is not None and self._process.poll() is not None:
+            if self._process and self._process.poll() is not None:
                 raise RuntimeError(f'the node has ended with {self._process.returncode}')
             self._executor.spin_once(timeout_sec=0.05)
         return True
@@ -182,14 +210,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     def _end_process(self) -> None:
         process, self._process = self._process, None
-        if process is None:
-            return
-        for number in (signal.SIGINT, signal.SIGKILL):
-            with contextlib.suppress(ProcessLookupError):
+        for number in (signal.SIGINT, signal.SIGKILL) if process else ():
+            with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(process.pid, number)
-            with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(ANSWER_S)
                 break
-        # Wait until its endpoints leave the graph, so that they are not taken for the next node's.
-        self._wait(lambda: not self._imu.get_subscription_count()
-                   and not self._node.count_publishers(self._topic), PATIENCE_S)

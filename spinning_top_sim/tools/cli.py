@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -106,7 +107,8 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
         return
     from tqdm import tqdm  # noqa: PLC0415 - it takes 50 ms
 
-    with tqdm(total=total, unit=unit, desc=what,
+    columns, rows = shutil.get_terminal_size()      # some terminals say 0, where tqdm is silent
+    with tqdm(total=total, unit=unit, desc=what, ncols=columns, nrows=rows,
               bar_format='{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} '
                          '[{elapsed}<{remaining}]') as bar:
         yield lambda done: bar.update(min(done, total) - bar.n)
