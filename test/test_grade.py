@@ -29,7 +29,7 @@ def short(simulator, body=WHEEL):
 
 
 @pytest.mark.parametrize(('told', 'faults', 'says'), [
-    (lambda q: q, [], 'no readings: the IMU is not graded'),
+    (lambda q: q, [], 'not judged: gyroscope: there is none'),
     (lambda q: q[:, [3, 0, 1, 2]], ['convention'], 'w, x, y, z'),
     (lambda q: q * (-1.0, -1.0, -1.0, 1.0), ['convention'], 'conjugated'),
     (lambda q: (Rotation.from_euler('x', -90, degrees=True) * Rotation.from_quat(q)).as_quat(),
@@ -99,7 +99,7 @@ def test_what_is_wrong_with_rates_may_have_all_causes_or_two_that_cannot_be_told
                 'rates': rates + wave * np.sin(20.0 * times)[:, np.newaxis] * (1.0, 0.3, -0.5)}
 
     report = grade(run, scenes=SCENES[1:2], dt=0.004)
-    assert report.passed and not report.unjudged, report
+    assert report.passed and 'rates' not in str(report.unjudged), report
     # In steady precession rates of another time are turned ones.
     tilt, l3, across = 1.2, 3.0, WHEEL.lambda1 * math.cos(1.2)
     rate = max(np.roots((across, -l3, WHEEL.gravity_torque)))
@@ -167,13 +167,14 @@ def at_rest(t):
 @pytest.mark.parametrize(('said', 'says'), [
     (lambda t: 1 / 0, 'cusps: run raises ZeroDivisionError'),
     (lambda t: sys.exit(3), 'cusps: run raises SystemExit'),
-    (lambda t: None, 'must have attitudes'),
-    (lambda t: np.ones((len(t), 4)), 'the norm must be 1'),
-    (lambda t: np.eye(4)[:1], '(1, 4), 0 numbers are not finite: must be (1001, 4)'),
-    (lambda t: {'attitudes': t, 'accelerometer': t}, "'accelerometer']: must have attitudes, and"),
+    (lambda t: None, 'attitudes of type NoneType: must have shape (1001, 4)'),
+    (lambda t: (at_rest(t), t), 'attitudes of type tuple: must have shape (1001, 4)'),
+    (lambda t: np.ones((len(t), 4)), 'attitudes[0]: |q| = 2: must be 1'),
+    (lambda t: np.eye(4)[:1], 'attitudes of shape (1, 4): must have shape (1001, 4)'),
+    (lambda t: {'attitudes': at_rest(t), 'accelerometer': t}, 'did you mean accelerations?'),
     (lambda t: {'attitudes': at_rest(t), 'rates': 0.0 * at_rest(t)[:, :3] + np.nan},
-     '3003 numbers are not finite'),
-    (lambda t: {'attitudes': at_rest(t), 'gyroscope': 'no'}, 'run raises ValueError')])
+     'rates[0, 0] = nan: must be finite'),
+    (lambda t: {'attitudes': at_rest(t), 'gyroscope': 'no'}, 'gyroscope of type str')])
 def test_what_is_no_motion_is_told(said, says):
     report = grade(lambda top, start, times, dt: said(times), scenes=SHORT[:1])
     assert report.faults == ['invalid_output'] and not report.marks
@@ -181,7 +182,10 @@ def test_what_is_no_motion_is_told(said, says):
 
 
 @pytest.mark.parametrize(('call', 'says'), [
-    (lambda: grade(Imu(), dt=0.0), 'dt = 0.0 s: must be positive'),
+    (lambda: grade(Imu(), dt=0.0), 'dt = 0.0 s, tolerance = 0.001745'),
+    (lambda: grade(Imu(), dt='0.1'), "dt = '0.1' s, tolerance"),
+    (lambda: grade(Imu(), tolerance=-1.0), 'tolerance = -1.0 rad: must be positive'),
+    (lambda: grade(Imu(), scenes=['loop']), "'loop': must be one of cusps, waves"),
     (lambda: grade(Imu(), dt=1.0), 'dt = 1.0 s, 6 scenes: must have one in which'),
     (lambda: grade(Imu(), scenes=[]), '0 scenes: must have one in which'),
     (lambda: replace(WHEEL, mounting=(1.0, 1.0, 0.0, 0.0)), 'norm must be 1'),

@@ -71,7 +71,7 @@ def test_columns_and_units_are_said_by_name_also_in_a_file(tmp_path):
         recorded = read(table(tmp_path / 'a.csv', foreign), text)
         same(recorded, ('attitudes', 'gyroscope', 'accelerations'))
         assert recorded.notes[-1] == 'not used: frame, ax'
-    assert 'accelerations of acc x:g, acc y:g, acc z:g: 600 rows, 200' in str(recorded.notes)
+    assert 'accelerations of acc x [g], acc y [g], acc z [g]: 600 rows, 200' in str(recorded.notes)
     assert 'the first time is 1700000000.123456789 s' in recorded.notes
     rows = table(tmp_path / 'c.csv', {'stamp': NS, **VALUES}).read_text().split('\n', 1)[1]
     (tmp_path / 'c.csv').write_text(rows)
@@ -130,7 +130,7 @@ TEXT = 't,qw,qx,qy,qz,gx,gy,gz\n' + ''.join(f'{k / 100},1,0,0,0,{k},2,3\n' for k
     ('', '', 'gx=gyro_x', '--columns gyro_x: the file has t, qw'),
     *(('', '', said, 'must be NAME=COLUMN:UNIT, with each NAME once, of t, qx')
       for said in ('speed=gx', 'gx=gx,gx=gy')),
-    ('gx,gy,gz', 'wx,wy,wz', None, "readings (--columns 'gx=COLUMN:UNIT, ...'); times of t:s"),
+    ('gx,gy,gz', 'wx,wy,wz', None, "'gx=COLUMN:UNIT, ...'); times of column t [s]"),
     (',3\n', ',3,4\n', None, 'line 2 has 9 values, and there are 8 columns'),
     (TEXT[:23], '', None, 'the file has column 1, column 2, column 3'),
     ('gy', 'gx', None, 'two columns are called gx'),

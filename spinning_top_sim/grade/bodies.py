@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.causes import CLEARLY, DENSITIES, OFFSETS, judge
 from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, UP, Comparison, Imu
+from spinning_top_sim.grade.files import PARTS, Recorded, known
+from spinning_top_sim.physics.top import numbers
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
 from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
@@ -26,7 +28,7 @@ JUMP = 10.0             # times a step of poses is longer than those beside and 
 def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STANDARD_GRAVITY,
                    subject: str = 'readings') -> Report:
     """
-    Grade the IMU of any rigid body against its poses.
+    Grade the IMU of any rigid body against its poses.  ValueError: a part is not as below.
 
     Parameters
     ----------
@@ -40,7 +42,10 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     subject : str
         Name of what is graded.
     """
-    imu, new = imu or Imu(), {name: held(name, values) for name, (_, values) in parts.items()}
+    imu, parts = imu or Imu(), _checked(parts)
+    if not isinstance(imu, Imu):
+        raise ValueError(f'imu = {imu!r}: must be an Imu, such as Imu(lever_arm=(x, y, z))')
+    new = {name: held(name, values) for name, (_, values) in parts.items()}
     faults = [fault for _, found in new.values() for fault in found]
     rows = {name: new[name][0] if new[name][1] else slice(None) if name in READINGS else
             smooth(values) for name, (_, values) in parts.items()}
@@ -62,6 +67,20 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     return Report(subject, faults, unjudged=unjudged).plus(*(
         judge(name, bodies, imu, gravity) if 'positions' in parts or name != 'accelerations' else
         Report('', unjudged=[f'{name}: without positions']) for name in READINGS if name in parts))
+
+
+def _checked(told: Parts) -> Parts:
+    """Return parts as those of a file are.  Raises ValueError."""
+    recorded = Recorded()
+    for name, pair in told.items():
+        width = len(PARTS[known(name, [*PARTS][1:])][0])
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError(f'{name}: must be times (n,) and values (n, {width})')
+        values = numbers(name, pair[1], 'n', width)
+        times = numbers(f'times of {name}', pair[0], len(values))
+        recorded.add(name, '', 1e9 * times, values, [f'{name}[{k}]' for k in range(len(times))])
+    recorded.check()
+    return recorded.parts
 
 
 def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:

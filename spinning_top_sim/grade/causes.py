@@ -34,10 +34,12 @@ CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 # Share by which a size may differ from that of a unit, and entries from those of axes: units are
 # further apart; and of a matrix that is no turn.
 LIKE, OF_TURN = 0.1, 0.3
-GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
+# Share by which gravity differs on Earth, and that of it which a small world still has.
+GRAVITY_BAND, ELSEWHERE = 6e-3, 0.05
 EARTH_FIELD = 15e-6, 90e-6  # [T]
 NOISE_BAND, OF_CHANCE = 0.05, 5.7   # by which noise may differ from what is declared
 ROUNDING = 1e-4             # share of a reading that is no noise
+SEEN = 1.5                  # by which a term must exceed its noise to be judged
 TELLS = 0.5                 # uncertainty of a share of a term up to which its fault can be told
 
 
@@ -49,6 +51,11 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
             any(kind in one.readings for one in stretches)))
     shift = compared.lag()
     model = compared.model(shift)
+    if kind == 'accelerations':
+        right, local = model.fit([]), model.fit(['gravity'])
+        if abs(local.found[-1]) < GRAVITY_BAND and local.beyond < UNEXPLAINED * right.beyond:
+            compared.gravity *= 1.0 + float(local.found[-1])    # of another place on Earth
+            model = compared.model(shift)
     found, rest = Causes(compared, model).find()
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
@@ -67,9 +74,11 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
         or_else = found[0].evidence if found else 'there is no fault'
         unjudged, found = [f'{kind}: {or_else}, or {text}: this motion does not tell'
                            f'{_needed(compared, SURE * sigma)}', *unjudged], []
+    unit = next(iter(compared.units))
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
-             f'{kind}_discrepancy': Mark(right.beyond),
-             f'{kind}_noise': Mark(compared.reading_noise), **dict(_estimates(kind, model))}
+             f'{kind}_discrepancy': Mark(right.beyond, meaning='of the reading'),
+             f'{kind}_noise': Mark(compared.reading_noise, meaning=unit),
+             **dict(_estimates(kind, model, unit))}
     if kind in DENSITIES and not found:         # beside a fault the noise is not known
         found = [*_noise_faults(compared, model, rest, getattr(imu, DENSITIES[kind]))]
     found = [Finding(name, text, late)] * is_late + found
@@ -77,8 +86,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
                   marks, unjudged=unjudged)
 
 
-def _interval(sigma: float) -> str:
-    return f'+- {1.96 * sigma:.2g}'
+def _interval(sigma: float, unit: str = '') -> str:
+    return f'+- {1.96 * sigma:.2g} {unit}'.rstrip()
 
 
 def listed(values: Reals) -> str:
@@ -155,11 +164,11 @@ class Causes:
     def _term(self, term: str, found: Reals) -> Finding | None:
         """Judge the size of a term."""
         share = 1.0 + float(found[-1])
-        text = f'the term {term} has {share:.3g} times its size'
+        text = f'the term {term} has {share:z.4f} times its size'
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
         if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
             return None
-        if abs(share) < NEAR:
+        if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
             return Finding(TERMS[term], text, share)
         if share < 0.0:
             return Finding('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
@@ -204,8 +213,8 @@ class Causes:
             return Finding('units' if np.array_equal(axes, AXES) else
                            'reading_sign' if np.array_equal(axes, -AXES) else
                            'sign' if np.array_equal(np.abs(axes), AXES) else 'axes',
-                           f'x, y, z read {conventions.axes(axes)}, {size:.4g} times what they '
-                           f'should{unit}', size)
+                           f'the readings are {size:.4g} times the right ones, axes '
+                           f'{conventions.axes(axes)}{unit}', size)
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             name, small = ('rates_scale', STRANGE) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
@@ -234,34 +243,38 @@ def _split_arm(found: Reals) -> Finding | None:
     """Judge by the arms that a x r and w x (w x r) have, where none is given."""
     sizes = np.linalg.norm(found[:3] + found[-3:]), np.linalg.norm(found[:3])
     shares = (sizes / np.max(sizes)).tolist()
-    return next((Finding(TERMS[term], f'the term {term} has {share:.3g} times its size', share)
+    return next((Finding(TERMS[term], f'the term {term} has {share:z.4f} times its size', share)
                  for term, share in zip(TERMS, shares, strict=False) if share < NEAR), None)
 
 
-def _estimates(kind: str, model: Model) -> Iterator[tuple[str, Mark]]:
+def _estimates(kind: str, model: Model, unit: str) -> Iterator[tuple[str, Mark]]:
     """Yield what the sensor is found to be, with intervals of 95 %."""
     what = 'field' if kind == 'magnetometer' else 'lever_arm'
     matrix = [f'{kind}_matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES]
     for effects, names, right in (
             ([], [f'{what}_{axis}' for axis in 'xyz'] * bool(model.always), np.zeros(3)),
             ([*MATRIX, *OFFSETS], [*matrix, *(f'{kind}_bias_{axis}' for axis in 'xyz')] * (
-                kind in DENSITIES), np.append(AXES, np.zeros(3)))):
+                kind in DENSITIES and model.clear('total', SEEN)), np.append(AXES, np.zeros(3)))):
         fit = model.fit(effects)
         for name, value, sigma, base in zip(
                 names, fit.found[-len(right):], fit.sigma[-len(right):], right, strict=False):
             if math.isfinite(sigma):
-                yield name, Mark(float(base + value), meaning=_interval(sigma))
+                of = 'm' if 'arm' in name else unit if 'matrix' not in name else ''
+                yield name, Mark(float(base + value), meaning=_interval(sigma, of))
 
 
 def _untold(compared: Comparison, model: Model) -> Iterator[str]:
     """Yield what cannot be told of the readings, and the poses that could tell it."""
     for name in {'accelerations': ('centripetal', 'linear', 'total'), 'magnetometer': ()}.get(
             compared.kind, ('total',)):
-        sigma = float(model.fit([name]).sigma[-1])
-        if SURE * sigma > TELLS and (model.clear(name, 1.5) or name == 'total'):
+        seen = model.clear(name, SEEN)
+        sigma = float(model.fit([name]).sigma[-1]) if seen else math.inf
+        if SURE * sigma > TELLS and (seen or name == 'total'):
             also = ', and of a bias,' if name == 'centripetal' and compared.noisy else ''
-            yield (f'{compared.kind}: the size of the term {name}{also} is known to '
-                   f'+- {196.0 * sigma:.2g} % only' + _needed(compared, SURE * sigma / TELLS))
+            what = 'reading' if name == 'total' else f'term {name}'
+            yield (f'{compared.kind}: the size of the {what}{also} ' + (
+                f'is known to +- {196.0 * sigma:.2g} % only' if seen else 'does not show here')
+                   + _needed(compared, SURE * sigma / TELLS))
 
 
 def _needed(compared: Comparison, worse: float) -> str:

@@ -10,7 +10,7 @@ import contextlib
 import csv
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -27,6 +27,7 @@ from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.foreign_messages import PLACES, samples
 from spinning_top_sim.tools.kinematics import Reals
+from spinning_top_sim.tools.scene_file import likely_name
 
 # Columns of each part of a motion, and factors of their units by name, the first by default.
 PARTS: dict[str, tuple[Sequence[str], Mapping[str, Any]]] = {
@@ -86,13 +87,37 @@ class Recorded:
             raise ValueError(f'{len(at)} rows of {kind}, {usual:.4g} s apart: must be '
                              f'{LEAST_SAMPLES} at least, {INTERVALS[0]:g} to {INTERVALS[1]:g} s '
                              "apart; the unit of times in a table: --columns 't=COLUMN:UNIT'")
-        norms = np.linalg.norm(values[at], axis=1, keepdims=True)
-        norms = norms if kind == 'attitudes' else np.ones_like(norms)
-        for k in np.flatnonzero(np.abs(norms - 1.0) >= NORM)[:1]:
-            raise ValueError(f'{rows[at[k]]}: |q| = {norms[k, 0]:.4g}: must be 1')
-        self.parts[kind] = times, values[at] / norms
+        values, names = values[at], [rows[row] for row in at]
+        self.parts[kind] = times, unit(values, names) if kind == 'attitudes' else values
         self.notes.append(f'{kind} of {source}: {len(at)} rows, {1.0 / usual:.4g} Hz, from '
                           f'{times[0]:.6g} to {times[-1]:.6g} s')
+
+    def check(self) -> None:
+        """Raise ValueError if there are no attitudes at the times of the other parts."""
+        if 'attitudes' not in self.parts:
+            raise ValueError('; '.join(['no attitudes', *self.notes]))
+        first, last = self.parts['attitudes'][0][[0, -1]]
+        for name, (times, _) in self.parts.items():
+            if times[0] > last or times[-1] < first:
+                raise ValueError(f'{name} from {times[0]:.6g} to {times[-1]:.6g} s, attitudes '
+                                 f'from {first:.6g} to {last:.6g} s: must be of one clock')
+
+
+def unit(attitudes: Reals, rows: Sequence[str]) -> Reals:
+    """Return quaternions (n, 4), normalized.  ValueError, by the name of a row: they are none."""
+    norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
+    for row in np.flatnonzero(np.abs(norms - 1.0) >= NORM)[:1]:
+        raise ValueError(f'{rows[row]}: |q| = {norms[row, 0]:.4g}: must be 1')
+    return attitudes / norms
+
+
+def known(name: Any, allowed: Collection[str]) -> str:
+    """Return a name.  ValueError, with a hint: it is not allowed."""
+    if name not in allowed:
+        alike = [one for one in allowed if one[:3] == str(name)[:3]] or allowed
+        raise ValueError(f'{name!r}: must be one of {", ".join(allowed)}'
+                         f'{likely_name(str(name), alike)}')
+    return str(name)
 
 
 def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> Recorded:
@@ -125,13 +150,7 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
                 table = dict(zip(OF_TUM, table.values(), strict=True))
             unused = _add(recorded, table, rows, columns_said(columns or ''))
         recorded.notes += [f'not used: {", ".join(unused)}'] * bool(unused)
-        if 'attitudes' not in recorded.parts:
-            raise ValueError('; '.join(['no attitudes', *recorded.notes]))
-        first, last = recorded.parts['attitudes'][0][[0, -1]]
-        for name, (times, _) in recorded.parts.items():
-            if times[0] > last or times[-1] < first:
-                raise ValueError(f'{name} from {times[0]:.6g} to {times[-1]:.6g} s, attitudes '
-                                 f'from {first:.6g} to {last:.6g} s: must be of one clock')
+        recorded.check()
     except (ValueError, EOFError, csv.Error, BadZipFile) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error
     return recorded
@@ -226,12 +245,12 @@ def _add(recorded: Recorded, columns: Columns, rows: Sequence[str], said: Chosen
         raise ValueError(f'--columns {missing.pop()}: the file has {", ".join(columns)}')
     for kind, (names, units) in PARTS.items():
         pairs = [pair for name in names for pair in chosen.get(name, ())]
-        source = ', '.join(f'{column}:{unit}' for column, unit in pairs)
+        source = ', '.join(f'{column} [{unit}]' for column, unit in pairs).replace(' [1]', '')
         numbers = [units[unit] * _numbers(rows, column, columns[column], unit)
                    for column, unit in pairs]
         if kind == 't':
             stamps = sum(numbers)
-            recorded.notes.append(f'times of {source}')
+            recorded.notes.append(f'times of column {source}')
         elif numbers:
             recorded.add(kind, source, stamps, np.stack(numbers, axis=1), rows)
     return [column for column in columns if column not in used]

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.bodies import held, undone
 from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, UNEXPLAINED, judge, listed
-from spinning_top_sim.grade.columns import AXES, KINDS, NORM, READINGS, STANDARD_GRAVITY
+from spinning_top_sim.grade.columns import AXES, DENSITIES, KINDS, READINGS, STANDARD_GRAVITY
+from spinning_top_sim.grade.files import known, unit
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.physics.top import State
+from spinning_top_sim.physics.top import State, numbers
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line, progress
@@ -35,10 +37,10 @@ UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
-def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
-          scenes: Sequence[Scene] = SCENES, tolerance: float = TOLERANCE) -> Report:
+def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
+          scenes: Sequence[Scene | str] | None = None, tolerance: float = TOLERANCE) -> Report:
     """
-    Grade a simulator.  ValueError: dt is not positive, or so long that no scene can be graded.
+    Grade a simulator.  ValueError: an argument, or dt so long that no scene can be graded.
 
     Parameters
     ----------
@@ -50,16 +52,21 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
         of the IMU (n, 3), SI.  The first time is 0, and all are multiples of dt.
     dt : float
         The step [s].  A scene in which the top turns by more than 0.7 rad in it is left out.
-    body, scenes : Body, sequence of Scene
-        The top with an IMU, and its motions.
+    body : Body, optional
+        The top with an IMU; default: WHEEL of `spinning_top_sim.grade.scenes`.
+    scenes : sequence of Scene or str, optional
+        Its motions, or names of such; default: all SCENES there.
     tolerance : float
         Largest error of an attitude that is no fault [rad].
     """
-    if not dt > 0.0:
-        raise ValueError(f'dt = {dt!r} s: must be positive')
+    if not (isinstance(dt, Real) and isinstance(tolerance, Real) and min(dt, tolerance) > 0.0):
+        raise ValueError(f'dt = {dt!r} s, tolerance = {tolerance!r} rad: must be positive')
+    body, names = body or WHEEL, {scene.name: scene for scene in SCENES}
+    chosen = [names[known(one, names)] if isinstance(one, str) else one
+              for one in (SCENES if scenes is None else scenes)]
     judgement, unjudged = Judgement(body, dt, tolerance), list[str]()
-    with progress('graded', len(scenes), 'scenes') as show:
-        for number, scene in enumerate(scenes):
+    with progress('graded', len(chosen), 'scenes') as show:
+        for number, scene in enumerate(chosen):
             show(number)
             start = scene.start_of(body)
             if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
@@ -70,36 +77,27 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
                 judgement.add(scene.name, start, told_motion(run, body, start, times, dt))
             except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
-    if len(unjudged) == len(scenes):
-        raise ValueError(f'dt = {dt!r} s, {len(scenes)} scenes: must have one in which the top '
+    if len(unjudged) == len(chosen):
+        raise ValueError(f'dt = {dt!r} s, {len(chosen)} scenes: must have one in which the top '
                          f'turns by at most {MOST:g} rad in a step')
     subject = one_line(getattr(run, '__name__', type(run).__name__))
-    notes = ['no readings: the IMU is not graded'] * bool(
-        judgement.motions and READINGS.keys().isdisjoint(judgement.motions[0].told.readings))
-    return Report(subject, judgement.faults, notes=notes, unjudged=unjudged).plus(
-        *judgement.reports())
+    for motion in judgement.motions[:1]:
+        unjudged += [f'{name}: there is none' for name in DENSITIES
+                     if name not in motion.told.readings]
+    return Report(subject, judgement.faults, unjudged=unjudged).plus(*judgement.reports())
 
 
 def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Stretch:
     """Return the motion that a run says.  Raises ValueError."""
     try:
         said = run(body, start, times.copy(), dt)
-        said = said if isinstance(said, Mapping) else {'attitudes': said}
-        readings: dict[str, Reals] = {name: np.array(said[name], dtype=float) for name in (
-            'attitudes', *KINDS) if said.get(name) is not None}
     except (Exception, SystemExit) as error:
         raise ValueError(f'run raises {type(error).__name__}: {one_line(error)}') from error
-    if 'attitudes' not in readings or not said.keys() <= {'attitudes', *KINDS}:
-        raise ValueError(f'what is returned has {[*said]}: must have attitudes, and may have '
-                         f'{", ".join(KINDS)}')
-    for name, values in readings.items():
-        shape, bad = (len(times), 4 if name == 'attitudes' else 3), ~np.isfinite(values)
-        if values.shape != shape or np.any(bad):
-            raise ValueError(f'{name} has shape {values.shape}, {np.sum(bad)} numbers are not '
-                             f'finite: must be {shape}, all finite')
-    attitudes = readings.pop('attitudes')
-    for at in np.flatnonzero(np.abs(np.linalg.norm(attitudes, axis=1) - 1.0) > NORM)[:1]:
-        raise ValueError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm must be 1')
+    said = said if isinstance(said, Mapping) else {'attitudes': said}
+    readings = {name: numbers(name, values, len(times), 4 if name == 'attitudes' else 3)
+                for name, values in {'attitudes': None, **said}.items()
+                if known(name, ('attitudes', *KINDS)) == 'attitudes' or values is not None}
+    attitudes = unit(readings.pop('attitudes'), [f'attitudes[{k}]' for k in range(len(times))])
     return Stretch(times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
                    {name: white(values, jumps=False) for name, values in readings.items()})
 
@@ -239,7 +237,7 @@ def _gyroscopic(found: Reals) -> Finding | None:
     share = 1.0 + float(found[0])
     return None if share >= NEAR else Finding(      # else it is the moments
         'no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
-        f'the gyroscopic term w x I w has {share:.3g} times its size', share)
+        f'the gyroscopic term w x I w has {share:z.4f} times its size', share)
 
 
 def _step(found: Reals) -> Finding:

@@ -14,6 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 # The largest number, and the inverse of the least moment of inertia: doubles hold the products.
 LARGEST = 1e50
 
@@ -175,6 +178,21 @@ def shown(value: object) -> str:
         return repr(value)
     except ValueError:
         return f'<{type(value).__name__} with too many digits>'
+
+
+def numbers(name: str, values: Any, *shape: int | str) -> NDArray[np.float64]:
+    """Return finite numbers of a shape, in which a letter is any length.  Raises ValueError."""
+    array = np.array(math.nan)
+    with suppress(TypeError, ValueError):
+        array = np.array(values, dtype=float)
+    if array.ndim != len(shape) or any(
+            isinstance(one, int) and one != has for one, has in zip(shape, array.shape,
+                                                                    strict=True)):
+        is_of = f'shape {array.shape}' if array.ndim else f'type {type(values).__name__}'
+        raise ValueError(f'{name} of {is_of}: must have shape ({", ".join(map(str, shape))})')
+    for at in np.argwhere(~np.isfinite(array))[:1]:
+        raise ValueError(f'{name}{at.tolist()} = {array[*at]}: must be finite')
+    return array
 
 
 def _freeze_as_floats(record: Top | State) -> None:

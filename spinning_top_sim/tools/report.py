@@ -111,11 +111,7 @@ class Report:
         return '\n'.join([*lines, *self.mark_lines()])
 
     def mark_lines(self) -> Iterator[str]:
-        """
-        Yield the marks as tables, without those that could not be measured.
-
-        Those that are called 'MARK: SCENE' are a table of their own, scene by mark.
-        """
+        """Yield the marks that were measured: 'MARK: SCENE' as a table, scene by mark."""
         known = {name: mark for name, mark in self.marks.items() if not math.isnan(mark.value)}
         of_scenes = {tuple(name.split(': ', 1)): known[name] for name in known if ': ' in name}
         limits = {what: _number(mark.limit) for (what, _), mark in of_scenes.items()}
@@ -128,7 +124,9 @@ class Report:
         others = {name: mark for name, mark in known.items() if ': ' not in name}
         if others:
             width = max(len(mark.meaning) for mark in others.values())
-            yield from cli.table_lines('Measures', ('measure', 'value', 'limit', ''), [
+            last = '+- (95 %)' if any('+-' in mark.meaning for mark in others.values()) else ''
+            head = 'measure', 'value', 'limit', last.ljust(width)
+            yield from cli.table_lines('Measures', head, [
                 (name, _number(mark.value), _number(mark.limit), mark.meaning.ljust(width))
                 for name, mark in others.items()])
 
