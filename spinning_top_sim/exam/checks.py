@@ -44,13 +44,7 @@ ARM = 0.1, 0.0, 0.0     # of the IMU off the axis [m]
 
 
 class Measured(NamedTuple):
-    """
-    What a check has measured.
-
-    name : of the fault, if it is another than the check's
-    limit : if it depends on the runs
-    others : further measures
-    """
+    """What a check has measured; `name`, `limit`: if they are others than the check's."""
 
     value: float
     evidence: str
@@ -71,10 +65,10 @@ class Check(NamedTuple):
 
 
 def repeat(exam: Exam) -> Measured:
-    """Feed two filters of one process with the same readings."""
+    """Feed two new filters with the same readings."""
     one, *_, same = exam.noise
     apart = measures.largest_turn(one.estimates, same.estimates)
-    return Measured(apart, 'two new filters of one process that get the same readings are '
+    return Measured(apart, 'two new filters that get the same readings are '
                     f'{degrees(apart)} apart: they are random, or share state')
 
 

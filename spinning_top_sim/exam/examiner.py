@@ -132,8 +132,7 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
         limit = check.limit if measured.limit is None else measured.limit
         marks |= {check.mark: Mark(measured.value, limit, check.meaning), **measured.others}
         if measured.value > limit:
-            found.append(Finding(measured.name or check.fault, measured.evidence,
-                                 measured.value))
+            found.append(Finding(measured.name or check.fault, measured.evidence, measured.value))
     show(len(CHECKS), len(CHECKS))
     notes = [f'not judged because of this: {", ".join(left_out)}'] if left_out else []
     absolute = 'no field' not in exam.told or exam.heading
@@ -159,8 +158,7 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], Scored]], kin
                 part = run.part(slice(1000))        # shows whether it uses the field
                 one, other = feed(make_filter, [part, replace(
                     part, magnetometer=part.magnetometer[:, [1, 2, 0]])])
-                whole = measures.largest_turn(one.estimates,
-                                              other.estimates) > measures.ROUNDING
+                whole = measures.largest_turn(one.estimates, other.estimates) > measures.ROUNDING
             outcomes.append(feed(make_filter, [run])[0].part(counts))
         except InvalidOutputError as error:
             failed.append(str(error))

@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -136,7 +136,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
         """Publish the readings, and wait for the attitude with their stamp."""
-        publish = partial(self._publish, gyroscope, accelerometer, magnetometer, dt)
+        publish = partial(self._publish, (gyroscope, accelerometer, magnetometer), dt)
         if not self._answered:
             self._begin(publish)
         elif not publish(ANSWER_S):
@@ -171,8 +171,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         if sent != self._first:
             raise NodeError(f'starts answer sample {self._first} or {sent} first: {self._lost}')
 
-    def _publish(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
-                 dt: float, seconds: float) -> bool:
+    def _publish(self, readings: Sequence[Reals | None], dt: float, seconds: float) -> bool:
         """Publish the readings of the next step; return whether there is an answer in time."""
         self._now_ns += round(dt * NANOSECONDS)
         clock, imu = Clock(), Imu()
@@ -180,13 +179,12 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
         imu.orientation_covariance[0] = NO_ORIENTATION
         field = MagneticField(header=imu.header)
-        for vector, values in ((imu.angular_velocity, gyroscope),
-                               (imu.linear_acceleration, accelerometer),
-                               (field.magnetic_field, magnetometer)):
+        vectors = imu.angular_velocity, imu.linear_acceleration, field.magnetic_field
+        for vector, values in zip(vectors, readings, strict=True):
             if values is not None:
                 vector.x, vector.y, vector.z = values.tolist()
         self._clock.publish(clock)
-        if magnetometer is not None:
+        if readings[-1] is not None:
             self._field.publish(field)
         self._imu.publish(imu)
         return self._wait(lambda: self._now_ns in self._answers, seconds)

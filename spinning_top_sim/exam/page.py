@@ -17,16 +17,7 @@ LIMITS = 'noisy_deg', 'error_rms_deg', 'field_rms_deg', 'data_rms_deg'
 
 
 def draw_page(report: Report, path: Path) -> None:
-    """
-    Draw what `examine` has returned.
-
-    Parameters
-    ----------
-    report : Report
-        What `examine` has returned.
-    path : path
-        A new file; its suffix decides the format.
-    """
+    """Draw what `examine` has returned into a new file, whose suffix decides the format."""
     limit = next((report.marks[name].limit for name in LIMITS if name in report.marks), math.nan)
     with rc_context({'text.parse_math': False}):        # names of a filter may contain '$'
         figure = Figure(figsize=(11.0, 4.0), layout='constrained')

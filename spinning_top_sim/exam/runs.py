@@ -36,12 +36,7 @@ BIAS, BIAS_S = np.array((0.006, -0.0055, 0.009)), 80.0
 
 
 class Exam:
-    """
-    The runs of one exam, each fed when a check asks for it.
-
-    convention : of the attitudes
-    told : outcomes by name, as they are told
-    """
+    """The runs of one exam, each fed when a check asks for it; `told`: outcomes by name."""
 
     def __init__(self, feed: Callable[[Sequence[Run]], list[Outcome]], imu: Mapping[str, Any],
                  seeds: Sequence[int]) -> None:

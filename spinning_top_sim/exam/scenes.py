@@ -105,8 +105,7 @@ def _device(random: np.random.Generator, scene: Scene,
         'seed': int(random.integers(2 ** 31)), **imu, **scene.values})
 
 
-def _motion(random: np.random.Generator,
-            scene: Scene) -> tuple[Rotation, Reals, Reals, Reals]:
+def _motion(random: np.random.Generator, scene: Scene) -> tuple[Rotation, Reals, Reals, Reals]:
     """Return attitudes, rates, accelerations and share of the motion at all half steps."""
     # The first and the last half step are for differences only.
     n = 2 * round(1e9 * (scene.motions[-1][1] + RAMP) / PERIOD_NS) + 2
