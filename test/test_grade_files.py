@@ -236,14 +236,14 @@ def of_top(path, t, q, *force):
             '--scene', 'looping']
 
 
-def test_the_lever_arm_of_a_scene_that_has_none_is_found(tmp_path, capsys):
+def test_the_lever_arm_of_a_scene_that_has_none_is_found_without_positions(tmp_path, capsys):
     motion = solve(TOP, START, T)
     w, arm = motion.angular_velocity, (0.1, 0.0, 0.2)
     force = (Rotation.from_quat(motion.quaternion).inv().apply((0.0, 0.0, TOP.gravity))
              + np.cross(motion.angular_acceleration, arm) + np.cross(w, np.cross(w, arm)))
     options = of_top(tmp_path / 'a.csv', T, motion.quaternion, force)
     assert main(options) == 0
-    assert 'lever_arm_z                       0.2' in capsys.readouterr().out
+    assert re.search('lever_arm_z +0.2 ', capsys.readouterr().out)
     assert main([*options, '--lever-arm', '0.1', '0', '0.1']) == 1
 
 
@@ -261,9 +261,3 @@ def test_poses_of_a_top_that_is_known_are_graded_without_readings(
     assert main(of_top(tmp_path / 'a.csv', T[chosen], q[chosen])) == code
     out = capsys.readouterr().out
     assert says in out and 'not judged: gyroscope: there is none' in out
-
-
-def test_readings_of_a_top_need_no_positions(tmp_path, capsys):
-    force = 9.0 * np.sin(np.outer(T, (20.0, 30.0, 40.0)))
-    assert main(of_top(tmp_path / 'b.csv', T, solve(TOP, START, T).quaternion, force)) == 1
-    assert 'inaccurate: accelerations' in capsys.readouterr().out
