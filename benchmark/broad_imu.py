@@ -26,11 +26,10 @@ def graded(path: Path) -> Report:
     trial = loadmat(path)
     t = np.arange(len(trial['imu_gyr'])) / float(trial['sampling_rate'].item())
     seen = np.all(np.isfinite(np.hstack((trial['opt_quat'], trial['opt_pos']))), axis=1)
-    return grade_readings({
+    return Report(path.stem).plus(grade_readings({
         'attitudes': (t[seen], trial['opt_quat'][seen][:, [1, 2, 3, 0]]),
         'positions': (t[seen], trial['opt_pos'][seen]), 'gyroscope': (t, trial['imu_gyr']),
-        'accelerations': (t, trial['imu_acc']), 'magnetometer': (t, UT * trial['imu_mag'])},
-        subject=path.stem)
+        'accelerations': (t, trial['imu_acc']), 'magnetometer': (t, UT * trial['imu_mag'])}))
 
 
 def told(found: Report, *names: str) -> str:

@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from helpers.inspected import log_of
 from helpers.logs import flipped, records_of
 from helpers.recordings import JAZZY, write_rows
-from helpers.reference import ROOT
 from mcap.opcode import Opcode
 from scipy.spatial.transform import Rotation
 
@@ -16,24 +16,16 @@ from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.grade.files import read
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.tools.simulate import main as simulate
 
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
     'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped', 'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped', 'nav_msgs/msg/Odometry')
 
 
-def simulated(path, *options):
-    assert simulate(['--quiet', '-o', str(path), '--duration', '10', '-p',
-                     'imu_data.enabled:=true', '--params', str(ROOT / 'config/wavy.yaml'),
-                     *options]) == 0
-    return path
-
-
 @pytest.fixture(scope='module')
 def log(tmp_path_factory):
-    return simulated(tmp_path_factory.mktemp('log') / 'run.mcap',
-                     '-p', 'imu.rpy:=[0.3, -0.2, 1.0]')
+    return log_of(tmp_path_factory.mktemp('log') / 'run.mcap', '--duration', 10, '--scene', 'wavy',
+                  '-p', 'imu_data.enabled:=true', '-p', 'imu.rpy:=[0.3, -0.2, 1.0]')
 
 
 @pytest.fixture(scope='module')

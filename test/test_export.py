@@ -6,13 +6,10 @@ import csv
 import numpy as np
 import pytest
 from helpers.inspected import log_of
+from helpers.node_logs import xyz
 from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.tools import inspect
-
-
-def xyz(vector):
-    return [vector.x, vector.y, vector.z]
 
 
 def pose_in(message):

@@ -115,7 +115,6 @@ TEXT = 't,qw,qx,qy,qz,gx,gy,gz\n' + ''.join(f'{k / 100},1,0,0,0,{k},2,3\n' for k
     ('gx,gy,gz', 'gx_dps,g_y,GZ', None, "'gx=gx_dps:UNIT, gy=g_y:UNIT, gz=GZ:UNIT', each UNIT"),
     ('gx', 'gx [deg/s] raw', None, "'gx=gx [deg/s] raw:UNIT'"),
     ('gx', 'gx [°/s]', None, "--columns 'gx=gx [°/s]:°/s': the unit must be one of rad/s"),
-    ('gy', 'imu.G_y', None, "'gy=imu.G_y:UNIT', each"),
     ('qw,qx,qy,qz,gx,gy', 'ref_qw,qx,qy,qz,sim_qw,gy', None, 'qw=ref_qw or sim_qw:UNIT'),
     ('gy', 'gx [deg/s]', None, 'gx=gx or gx [deg/s]:UNIT, gy=COLUMN:UNIT'),
     ('', '', 't=t:us', "25 rows of attitudes, 1e-08 s apart: must be 20 at least, 1e-05 to 0.5 s "
@@ -127,14 +126,13 @@ TEXT = 't,qw,qx,qy,qz,gx,gy,gz\n' + ''.join(f'{k / 100},1,0,0,0,{k},2,3\n' for k
       for cell in ('1_0', '1e400', 'deg/s', '-1;5')),
     *(('0.0,', f'{cell},', None, f"line 2: t = '{cell}': must be a number such as -12.5")
       for cell in ('', 'nan', '2026-01-31T12:00:00')),
-    ('', '', 'gx=gyro_x', '--columns gyro_x: the file has t, qw'),
+    ('', '', 'gx=gyro_x', "'gyro_x': must be one of t, qw, qx"),
     *(('', '', said, 'must be NAME=COLUMN:UNIT, with each NAME once, of t, qx')
       for said in ('speed=gx', 'gx=gx,gx=gy')),
     ('gx,gy,gz', 'wx,wy,wz', None, "'gx=COLUMN:UNIT, ...'); times of column t [s]"),
     (',3\n', ',3,4\n', None, 'line 2 has 9 values, and there are 8 columns'),
     (TEXT[:23], '', None, 'the file has column 1, column 2, column 3'),
     ('gy', 'gx', None, 'two columns are called gx'),
-    (TEXT[23:], '', None, '0 rows of attitudes'),
     (TEXT[TEXT.index('0.19'):], '', None, '19 rows of attitudes, 0.01 s apart: must be 20'),
     (TEXT, '', None, "say --columns 't=COLUMN"),
     ('gx', b'gx [\xb0/s]', None, 'no text in UTF-8: convert it'),
@@ -223,7 +221,7 @@ def test_a_log_of_this_package_is_graded_against_its_own_exact_motion(
     monkeypatch.setattr('spinning_top_sim.grade.command.TOLERANCE', -1.0)
     assert main([path, '-p', 'imu.rpy:=[0.0, 0.0, 0.0]']) == 1
     out = capsys.readouterr().out
-    assert 'mounting: gyroscope: the readings are in axes that are turned by' in out
+    assert 'mounting: gyroscope: the axes of the readings are turned by' in out
     assert 'inaccurate: the attitude is up to' in out
 
 
@@ -238,14 +236,14 @@ def of_top(path, t, q, *force):
             '--scene', 'looping']
 
 
-def test_the_lever_arm_of_a_scene_that_has_none_is_found(tmp_path, capsys):
+def test_the_lever_arm_of_a_scene_that_has_none_is_found_without_positions(tmp_path, capsys):
     motion = solve(TOP, START, T)
     w, arm = motion.angular_velocity, (0.1, 0.0, 0.2)
     force = (Rotation.from_quat(motion.quaternion).inv().apply((0.0, 0.0, TOP.gravity))
              + np.cross(motion.angular_acceleration, arm) + np.cross(w, np.cross(w, arm)))
     options = of_top(tmp_path / 'a.csv', T, motion.quaternion, force)
     assert main(options) == 0
-    assert 'lever_arm_z                       0.2' in capsys.readouterr().out
+    assert re.search('lever_arm_z +0.2 ', capsys.readouterr().out)
     assert main([*options, '--lever-arm', '0.1', '0', '0.1']) == 1
 
 
@@ -263,9 +261,3 @@ def test_poses_of_a_top_that_is_known_are_graded_without_readings(
     assert main(of_top(tmp_path / 'a.csv', T[chosen], q[chosen])) == code
     out = capsys.readouterr().out
     assert says in out and 'not judged: gyroscope: there is none' in out
-
-
-def test_readings_of_a_top_need_no_positions(tmp_path, capsys):
-    force = 9.0 * np.sin(np.outer(T, (20.0, 30.0, 40.0)))
-    assert main(of_top(tmp_path / 'b.csv', T, solve(TOP, START, T).quaternion, force)) == 1
-    assert 'inaccurate: accelerations' in capsys.readouterr().out

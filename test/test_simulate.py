@@ -5,16 +5,12 @@ import json
 
 import numpy as np
 import pytest
+from helpers.inspected import log_of as simulate
 from helpers.node_logs import SECOND, log_of
 
 from spinning_top_sim import scene, solve
 from spinning_top_sim.tools import inspect
 from spinning_top_sim.tools.simulate import main
-
-
-def simulate(path, *arguments):
-    assert main(['-o', str(path), '--quiet', *map(str, arguments)]) == 0
-    return path
 
 
 def read(path):

@@ -25,8 +25,8 @@ HELD_RUNS, HELD_SHARE = 20, 0.95    # of a hold: runs of equal rows, share of eq
 JUMP = 10.0             # times a step of poses is longer than those beside and than usual
 
 
-def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STANDARD_GRAVITY,
-                   subject: str = 'readings') -> Report:
+def grade_readings(parts: Parts, imu: Imu | None = None, *,
+                   gravity: float = STANDARD_GRAVITY) -> Report:
     """
     Grade the IMU of any rigid body against its poses.  ValueError: a part is not as below.
 
@@ -39,12 +39,8 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
         What is known of it; default: nothing, along axes of the body.
     gravity : float
         Where the body is [m/s^2]; that of another place on Earth is no fault.
-    subject : str
-        Name of what is graded.
     """
     imu, parts = imu or Imu(), _checked(parts)
-    if not isinstance(imu, Imu):
-        raise ValueError(f'imu = {imu!r}: must be an Imu, such as Imu(lever_arm=(x, y, z))')
     new = {name: held(name, values) for name, (_, values) in parts.items()}
     faults = [fault for _, found in new.values() for fault in found]
     rows = {name: new[name][0] if new[name][1] else slice(None) if name in READINGS else
@@ -58,13 +54,13 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
            f'the body turns by more than {MOST:g} rad between two samples'
            if any(body.coarse for body in bodies) else '')
     if why:
-        return Report(subject, faults, unjudged=[f'readings: {why}', *unjudged])
+        return Report('readings', faults, unjudged=[f'readings: {why}', *unjudged])
     convention = convention_of(bodies, imu, gravity)
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
                               'undone'))
         bodies = [undone(body, convention) for body in bodies]
-    return Report(subject, faults, unjudged=unjudged).plus(*(
+    return Report('readings', faults, unjudged=unjudged).plus(*(
         judge(name, bodies, imu, gravity) if 'positions' in parts or name != 'accelerations' else
         Report('', unjudged=[f'{name}: without positions']) for name in READINGS if name in parts))
 
@@ -123,10 +119,8 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     """
     ours, *others = (one for one in conventions.group() if not _of_sensor(one))
     body = max(bodies, key=lambda one: len(one.t))
-    angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
-    count = min(EXCERPT, len(angles) - 1)
-    first = int(np.argmax(angles[count:] - angles[:-count]))
-    body = body.part(slice(first, first + count))       # in which it turns the most
+    first = max(len(body.t) - EXCERPT, 0) // 2          # it may rest at first, and at last
+    body = body.part(slice(first, first + EXCERPT))
     # No convention changes how fast quaternions change, and so none the noise in rates.
     widths = {name: [compared.motions[0][0].width] for name in ('gyroscope', 'accelerations')
               if (compared := Comparison(name, [body], imu, gravity)).motions}

@@ -2,8 +2,7 @@
 """
 Compares readings with the motion of the same simulator or recording, and names what is wrong.
 
-A reading is regressed on the terms of its motion and on effects of defects.  As few causes as
-possible explain what a right reading does not, and are named by the sizes of their effects.
+A reading is regressed on the terms of its motion and on effects of defects.
 """
 
 import math
@@ -76,7 +75,6 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
                            f'{_needed(compared, SURE * sigma)}', *unjudged], []
     unit = next(iter(compared.units))
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
-             f'{kind}_discrepancy': Mark(right.beyond, meaning='of the reading'),
              f'{kind}_noise': Mark(compared.reading_noise, meaning=unit),
              **dict(_estimates(kind, model, unit))}
     if kind in DENSITIES and not found:         # beside a fault the noise is not known
@@ -202,11 +200,9 @@ class Causes:
     def _matrix(self, matrix: Reals) -> Finding | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
         size = abs(float(np.linalg.det(matrix))) ** (1.0 / 3.0)
-        # A unit, or one that is converted twice.
-        unit, times = next(((f', in {name}', times) for name, factor in self.compared.units.items()
-                            for times in (1.0 / factor, factor)
-                            if factor != 1.0 and abs(size / times - 1.0) < LIKE), ('', 1.0))
-        shape, change = matrix / times, float(np.max(np.abs(matrix - AXES)))
+        unit, factor = next(((f', in {name}', one) for name, one in self.compared.units.items()
+                             if one != 1.0 and abs(size * one - 1.0) < LIKE), ('', 1.0))
+        shape, change = matrix * factor, float(np.max(np.abs(matrix - AXES)))
         axes = np.rint(shape)
         if np.array_equal(axes @ axes.T, AXES) and np.max(np.abs(shape - axes)) < LIKE and (
                 unit or not np.array_equal(axes, AXES)):
@@ -226,9 +222,8 @@ class Causes:
                 REAL, OF_TURN * change):
             vector = Rotation.from_matrix(turn).inv().as_rotvec()
             angle = float(np.linalg.norm(vector))
-            return Finding('mounting' * (angle > self.strange), 'the readings are in axes that '
-                           f'are turned by ({listed(vector)}) rad from those of the IMU{unit}',
-                           angle)
+            return Finding('mounting' * (angle > self.strange), 'the axes of the readings are '
+                           f'turned by ({listed(vector)}) rad{unit}', angle)
         return None
 
 

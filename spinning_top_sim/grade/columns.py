@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.physics.top import numbers
 from spinning_top_sim.tools import kinematics
 from spinning_top_sim.tools.identify import SURE, TARGET, Model, rms
 from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
@@ -63,9 +64,7 @@ class Imu:
 
     def __post_init__(self) -> None:
         for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
-            value = getattr(self, name) or (0.0,) * length
-            if np.shape(value) != (length,) or not np.all(np.isfinite(value)):
-                raise ValueError(f'{name} = {value!r}: must be {length} finite numbers')
+            numbers(name, getattr(self, name) or [0.0] * length, length)
         if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
             raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
 

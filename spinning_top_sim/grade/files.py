@@ -122,10 +122,7 @@ def known(name: Any, allowed: Collection[str]) -> str:
 
 def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> Recorded:
     """
-    Read a log, a table, or a folder of EuRoC.
-
-    columns : what --columns says, or the path of a file that holds it
-    topics : to read, of transforms TOPIC:CHILD; by default the only ones of each kind
+    Read a log, a table, or a folder of EuRoC, as `--columns` and `--topic` of the command say.
 
     Raises OSError, ImportError, LogError or ValueError, which name the file and what to type.
     """
@@ -159,9 +156,6 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
 def _add_log(recorded: Recorded, path: Path, wanted: Sequence[str]) -> list[str]:
     """Add the parts of a log; return what is not used.  Raises LogError or ValueError."""
     ours, end_ns = list[str | None](), NEVER_NS
-    bag = path / 'metadata.yaml'
-    if bag.exists() and len({*re.findall(r'\S+\.mcap', bag.read_text('utf-8'))}) > 1:
-        raise ValueError('the bag has several files: make one of them by ros2 bag convert')
     with LogReader(path) as reader:
         with contextlib.suppress(recorded_run.ForeignLogError):
             run = recorded.run = recorded_run.read_run_description(reader)
@@ -240,9 +234,7 @@ def _chosen(columns: Columns, said: Chosen, wanted: Sequence[str]) -> Chosen:
 def _add(recorded: Recorded, columns: Columns, rows: Sequence[str], said: Chosen) -> list[str]:
     """Add the parts of a table; return what is not used.  Raises ValueError."""
     chosen = _chosen(columns, said, ('t',) if recorded.parts else ('t', 'attitudes'))
-    used = {column for pairs in chosen.values() for column, _ in pairs}
-    if missing := used - columns.keys():
-        raise ValueError(f'--columns {missing.pop()}: the file has {", ".join(columns)}')
+    used = {known(column, columns) for pairs in chosen.values() for column, _ in pairs}
     for kind, (names, units) in PARTS.items():
         pairs = [pair for name in names for pair in chosen.get(name, ())]
         source = ', '.join(f'{column} [{unit}]' for column, unit in pairs).replace(' [1]', '')

@@ -2,8 +2,8 @@
 """What a simulator is given: a top with an IMU on it and its start; and the motions graded."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -69,15 +69,11 @@ class Start(State):
 
 @dataclass(frozen=True)
 class Scene:
-    """A motion of a duration [s] that is graded; `start`: l3, lz, theta, theta_dot, or 0."""
+    """A motion of a duration [s] that is graded."""
 
     name: str
-    start: Mapping[str, float]
+    start: State
     duration: float
-
-    def start_of(self, top: Top) -> Start:
-        """Return the start, along no axes of the world."""
-        return Start.of(top, State(phi=0.861, psi=-1.447, **self.start))
 
 
 # The bicycle wheel of config/cusp.yaml, with an IMU off its axis.
@@ -85,11 +81,12 @@ WHEEL = Body(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=S
              lever_arm=(0.12, -0.05, 0.2), mounting=(0.4, -0.2, 0.4, 0.8),
              gyroscope_noise_density=0.0, accelerometer_noise_density=0.0)
 TILT = math.radians(30.0)
+TURNED = partial(State, phi=0.861, psi=-1.447)      # along no axes of the world
 # As in config/, but for the last two: one passes the upward vertical, one spins at 60 rad/s.
 SCENES = (
-    Scene('cusps', {'theta': TILT, 'l3': 1.6, 'lz': 1.6 * math.cos(TILT)}, 10.0),
-    Scene('waves', {'theta': TILT, 'l3': 1.6, 'lz': 1.42}, 4.0),
-    Scene('loops', {'theta': TILT, 'l3': 1.6, 'lz': 1.3}, 4.0),
-    Scene('near the separatrix', {'theta': 1.179087, 'l3': 1.0, 'lz': 1.0}, 4.0),
-    Scene('pole', {'theta': 0.6, 'theta_dot': -4.0, 'l3': 1.0, 'lz': 1.0}, 4.0),
-    Scene('fast spin', {'theta': TILT, 'l3': 9.0, 'lz': 9.0 * math.cos(TILT)}, 2.0))
+    Scene('cusps', TURNED(theta=TILT, l3=1.6, lz=1.6 * math.cos(TILT)), 10.0),
+    Scene('waves', TURNED(theta=TILT, l3=1.6, lz=1.42), 4.0),
+    Scene('loops', TURNED(theta=TILT, l3=1.6, lz=1.3), 4.0),
+    Scene('near the separatrix', TURNED(theta=1.179087, l3=1.0, lz=1.0), 4.0),
+    Scene('pole', TURNED(theta=0.6, theta_dot=-4.0, l3=1.0, lz=1.0), 4.0),
+    Scene('fast spin', TURNED(theta=TILT, l3=9.0, lz=9.0 * math.cos(TILT)), 2.0))

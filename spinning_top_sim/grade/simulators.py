@@ -16,7 +16,6 @@ from spinning_top_sim.grade.causes import GRAVITY_BAND, LATE, UNEXPLAINED, judge
 from spinning_top_sim.grade.columns import AXES, DENSITIES, KINDS, READINGS, STANDARD_GRAVITY
 from spinning_top_sim.grade.files import known, unit
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
-from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import State, numbers
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import conventions
@@ -29,8 +28,7 @@ Simulate = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].
 TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
-RIGHT = 0.2             # share of their error that is left in the convention that they are in
-SAME = 0.1              # share of an error that another time leaves
+RIGHT = 0.1             # share of an error that the right convention, or time, leaves
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
@@ -38,7 +36,7 @@ SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
 def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
-          scenes: Sequence[Scene | str] | None = None, tolerance: float = TOLERANCE) -> Report:
+          scenes: Sequence[Scene] = SCENES, tolerance: float = TOLERANCE) -> Report:
     """
     Grade a simulator.  ValueError: an argument, or dt so long that no scene can be graded.
 
@@ -54,21 +52,19 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
         The step [s].  A scene in which the top turns by more than 0.7 rad in it is left out.
     body : Body, optional
         The top with an IMU; default: WHEEL of `spinning_top_sim.grade.scenes`.
-    scenes : sequence of Scene or str, optional
-        Its motions, or names of such; default: all SCENES there.
+    scenes : sequence of Scene
+        Its motions; default: all SCENES there.
     tolerance : float
         Largest error of an attitude that is no fault [rad].
     """
     if not (isinstance(dt, Real) and isinstance(tolerance, Real) and min(dt, tolerance) > 0.0):
         raise ValueError(f'dt = {dt!r} s, tolerance = {tolerance!r} rad: must be positive')
-    body, names = body or WHEEL, {scene.name: scene for scene in SCENES}
-    chosen = [names[known(one, names)] if isinstance(one, str) else one
-              for one in (SCENES if scenes is None else scenes)]
-    judgement, unjudged = Judgement(body, dt, tolerance), list[str]()
-    with progress('graded', len(chosen), 'scenes') as show:
-        for number, scene in enumerate(chosen):
+    body, unjudged = body or WHEEL, list[str]()
+    judgement = Judgement(body, dt, tolerance)
+    with progress('graded', len(scenes), 'scenes') as show:
+        for number, scene in enumerate(scenes):
             show(number)
-            start = scene.start_of(body)
+            start = Start.of(body, scene.start)
             if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
                 unjudged.append(f'{scene.name}: the top turns by more than {MOST:g} rad in a step')
                 continue
@@ -77,13 +73,12 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
                 judgement.add(scene.name, start, told_motion(run, body, start, times, dt))
             except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
-    if len(unjudged) == len(chosen):
-        raise ValueError(f'dt = {dt!r} s, {len(chosen)} scenes: must have one in which the top '
+    if len(unjudged) == len(scenes):
+        raise ValueError(f'dt = {dt!r} s, {len(scenes)} scenes: must have one in which the top '
                          f'turns by at most {MOST:g} rad in a step')
     subject = one_line(getattr(run, '__name__', type(run).__name__))
-    for motion in judgement.motions[:1]:
-        unjudged += [f'{name}: there is none' for name in DENSITIES
-                     if name not in motion.told.readings]
+    unjudged += [f'{name}: there is none' for name in DENSITIES for motion in judgement.motions[:1]
+                 if name not in motion.told.readings]
     return Report(subject, judgement.faults, unjudged=unjudged).plus(*judgement.reports())
 
 
@@ -140,7 +135,7 @@ class Judgement:
         model = Model([{TARGET: errors[:EARLY], 'late': -self.dt * w,
                         'slow': told.t[:EARLY, np.newaxis] * w}])
         fit = model.fit(['late', 'slow'])
-        late, explained = float(fit.found[0]), fit.rest < SAME * model.size(TARGET)
+        late, explained = float(fit.found[0]), fit.rest < RIGHT * model.size(TARGET)
         if explained and abs(late) > LATE:
             self.faults.append(Finding(
                 'late' if late > 0.0 else 'early', f'{name}: the attitudes are those of '
@@ -153,42 +148,25 @@ class Judgement:
         """Yield what is wrong with the motions and with each reading."""
         if not self.motions:
             return
-        of_rates = self._readings('rates')
-        scaled = [one.name for one in of_rates.found] == ['rates_scale'] and max(
-            motion.worst for motion in self.motions) > self.tolerance
+        worst = max(self.motions, key=lambda motion: motion.worst)
+        wrong, of_rates = worst.worst > self.tolerance, self._readings('rates')
+        scaled = wrong and [one.name for one in of_rates.found] == ['rates_scale']
         if scaled or not (of_rates.found or of_rates.unjudged):     # what is told is known
             for motion in self.motions:
                 motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
         yield Report('', of_rates.found, unjudged=of_rates.unjudged)
-        yield Report('', [one for one in self._of_motions() if not (
-            scaled and one.name == 'inaccurate')])
-        yield from map(self._marks, self.motions)
+        found = [] if worst.slow or not wrong else _equations(
+            self.body, [motion.told for motion in self.motions])
+        error, limit = math.degrees(worst.worst), math.degrees(self.tolerance)
+        text = f'{worst.name}: the attitude is up to {error:.3g} deg off'
+        yield Report('', [one._replace(evidence=f'{text}; {one.evidence}') for one in found] or [
+            Finding('inaccurate', text, error)] * (wrong and not scaled), {
+                f'total_error_deg: {motion.name}': Mark(math.degrees(motion.worst), limit)
+                for motion in self.motions})
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
         return judge(kind, [one.told for one in self.motions], self.body, self.body.gravity)
-
-    def _marks(self, motion: Motion) -> Report:
-        """Return the largest error, and the relative change of the energy."""
-        smoothed, limit = Smoothed(motion.told, 1), math.degrees(self.tolerance)
-        energy = (0.5 * smoothed.rates ** 2 @ self.body.inertia
-                  + self.body.gravity_torque * smoothed.turn[:, 2, 2])
-        drift = np.max(np.abs(relative_drift(energy, float(energy[0]))))
-        return Report('', marks={
-            f'total_error_deg: {motion.name}': Mark(math.degrees(motion.worst), limit),
-            f'energy_drift: {motion.name}': Mark(float(drift))})
-
-    def _of_motions(self) -> Iterator[Finding]:
-        worst = max(self.motions, key=lambda motion: motion.worst)
-        if worst.worst <= self.tolerance:
-            return
-        text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        found = [] if worst.slow else _equations(
-            self.body, [motion.told for motion in self.motions])
-        yield from (one._replace(evidence=f'{text}; {one.evidence}') for one in found)
-        if not found:
-            yield Finding('inaccurate', text + '; it turns at other rates from the start on' * (
-                worst.slow), math.degrees(worst.worst))
 
 
 def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
@@ -199,8 +177,7 @@ def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
     found, rest = explain(model, [
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(
-            'inertia_frame', 'the gyroscopic term is that of moments of inertia about axes of the '
-            'world')),
+            'inertia_frame', 'the moments of inertia are about axes of the world')),
         Cause(['damping', 'axis damping'], _damping),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
@@ -215,8 +192,7 @@ def _terms(body: Body, motion: Stretch) -> dict[str, Reals]:
     gyroscopic = -np.cross(w, w * inertia) / inertia
     arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in AXES]
     gravity, products = body.com_distance * arms[2], w[:, [1, 2, 0]] * w[:, [2, 0, 1]]
-    # Effects of other moments: on the torque of gravity about e1 and e2 (I1, I2), then on
-    # (I2 - I3)/I1, (I3 - I1)/I2 and (I1 - I2)/I3, which are fitted, but not read.
+    # Effects of other moments: by gravity about e1 and e2, and by (I2 - I3)/I1 and so on.
     euler = [gravity * AXES[0], gravity * AXES[1], *(products * axis for axis in AXES)]
     nodes = {'gyroscopic': gyroscopic, 'gravity': gravity,
              'in world': along(smoothed.back, -np.cross(world, world * inertia) / inertia),
@@ -242,13 +218,11 @@ def _gyroscopic(found: Reals) -> Finding | None:
 
 def _step(found: Reals) -> Finding:
     at, gravity_at = (0.5 + found).tolist()
-    name, means = (('first_order', f'gravity at {gravity_at:.3g}') if
-                   abs(found[0]) < 0.5 * abs(found[1]) else
-                   ('implicit_damping', 'it removes energy') if at > 0.5 else
-                   ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
-                   ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
-    return Finding(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
-                   f'is 0.5: {means}', at)
+    name = ('first_order' if abs(found[0]) < 0.5 * abs(found[1]) else
+            'implicit_damping' if at > 0.5 else
+            'explicit_gyroscopic_term' if at > -0.5 else 'coriolis_sign')
+    return Finding(name, f'in the mean, the gyroscopic term is taken at {at:.3g} of a step, '
+                   f'gravity at {gravity_at:.3g}; right is 0.5', at)
 
 
 def _damping(found: Reals) -> Finding:

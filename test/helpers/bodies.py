@@ -66,11 +66,7 @@ def free(t, random, rate):
 
 
 def body(seed, noisy=None, seconds=20.0, kind=None, rate=None):
-    """
-    Return a random body.
-
-    noisy : of the poses: None for either
-    """
+    """Return a random body; `noisy`: whether its poses are, by chance where None."""
     random = np.random.default_rng(seed)
     hz = rate or random.choice((50.0, 100.0, 200.0, 500.0, 1000.0))
     t = np.arange(round(seconds * hz)) / hz

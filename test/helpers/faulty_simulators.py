@@ -54,12 +54,7 @@ def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, worl
 
 
 def stepped(top, start, times, dt, method):
-    """
-    Return the same by steps of first order.
-
-    method : of the gyroscopic term: explicit, implicit, midpoint, or wrong derivative, where an
-        implicit step has its derivative with the wrong sign
-    """
+    """Return the same by steps of first order, with a method for the gyroscopic term."""
     turn, (w1, w2, spin) = Rotation.from_quat(start.attitude), start.rates
     across, rows = complex(w1, w2), []
     share = (top.lambda1 - top.lambda3) / top.lambda1 * spin
@@ -82,7 +77,6 @@ class Imu:
 
     motion : function of (top, start, times, dt) that returns attitudes, rates and accelerations
     defect : a name in DEFECTS, or a function that returns readings along axes of the body
-    seed : of the noise
     parts : of what is returned, beside the attitudes
     """
 
