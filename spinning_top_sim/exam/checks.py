@@ -138,8 +138,9 @@ def steps(exam: Exam) -> Measured:
     for k, here in enumerate(lengths == length for length in STEPS):
         one, other = equal[here], uneven[here] - equal[here]
         factor = np.vdot(one, other) / max(np.vdot(one, one), measures.ROUNDING)
-        found[k] = [np.median(np.linalg.norm(rows, axis=1))
-                    for rows in (other, other - factor * one)]
+        size, *found[k] = (np.median(np.linalg.norm(rows, axis=1))
+                           for rows in (one, other, other - factor * one))
+        found[k] /= max(size, 1.0)
     worst = int(np.argmax(found[:, 0]))
     off, left = found[worst].tolist()
     name, why = ('accuracy', 'by no factor') if left > EXPLAINED * off else (

@@ -146,12 +146,13 @@ class Exam:
         rates[[0, 1], -BACK, axes] += SMALL * RATE
         return self.outcomes(str(start), lambda: [replace(run, gyroscope=one) for one in rates])
 
-    def answers(self, size: float = SMALL,
+    def answers(self, size: float = 0.1 * SMALL,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
         """
         Return kicks about the vertical (n, 3), and how they move attitudes (n, ANSWER, 3).
 
-        size : of a kick in a step of 1 / RATE [rad]; in other steps it is as fast
+        size : of a kick in a step of 1 / RATE [rad], small even for a filter that reads degrees;
+            in other steps it is as fast
         lengths : of the steps, one in the end of each rest [s]
         """
         steps, still, run = self.ends - ANSWER, self.still.estimates, self.run.without_field()
