@@ -146,7 +146,7 @@ class Exam:
         rates[[0, 1], -BACK, axes] += SMALL * RATE
         return self.outcomes(str(start), lambda: [replace(run, gyroscope=one) for one in rates])
 
-    def answers(self, size: float = 0.1 * SMALL,
+    def answers(self, size: float = 0.6 * SMALL,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
         """
         Return kicks about the vertical (n, 3), and how they move attitudes (n, ANSWER, 3).
