@@ -144,8 +144,8 @@ def steps(exam: Exam) -> Measured:
     off, left, gain = found[worst].tolist()
     # The next check tells a wrong gain; some right filters are never quite still.
     limit = max(GAIN_OFF, EXPLAINED * abs(gain - 1.0))
-    evidence = (f'a turn in a step of {1e3 * STEPS[worst]:g} ms is {off:.3g} of it off one as fast '
-                f'in {1e3 / RATE:g} ms')
+    evidence = (f'a turn in a step of {1e3 * STEPS[worst]:g} ms is {off:.3g} of it off one as '
+                f'fast in {1e3 / RATE:g} ms')
     if left > EXPLAINED * off:
         return Measured(off, f'{evidence}: by no factor', 'accuracy', max(limit, EXPLAINED))
     return Measured(off, f'{evidence}: the length is misused', limit=limit)
