@@ -145,7 +145,7 @@ WRONG = {
     'w first': (partial(Part, said=lambda q: q[[3, 0, 1, 2]]), 'convention'),
     'w first, NED': (partial(Part, said=lambda q: product(NED, q)[[3, 0, 1, 2]]), 'convention'),
     'vector positive': (partial(Part, said=np.abs), 'accuracy'),
-    'rounded': (partial(Part, said=lambda q: np.round(q, 3) / np.linalg.norm(np.round(q, 3))),
+    'rounded': (partial(Part, said=lambda q: np.round(q, 2) / np.linalg.norm(np.round(q, 2))),
                 'accuracy'),
     'one step late': (partial(Part, late=(0, 0, 0, 1)), 'timing'),
     'dt of 100 Hz': (partial(Part, Mahony, step=lambda dt: 0.01), 'timing'),
