@@ -68,7 +68,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     name = 'early' if late < 0.0 else 'late'
     text = (f'the readings are {abs(late):.3g} {_interval(sigma)} steps of '
             f'{1e3 * compared.own_step:.3g} ms {name}')
-    is_late = bool(shift or not found) and abs(late) > max(LATE + 1.96 * sigma, SURE * sigma)
+    near = abs(late / compared.steps - shift) < 1.0     # else it is no lag that `step` tells
+    is_late = (near if shift else not found) and abs(late) > max(LATE + 1.96 * sigma, SURE * sigma)
     if not is_late and not abs(late) + 1.96 * sigma <= LATE and (either or not found):
         or_else = found[0].evidence if found else 'there is no fault'
         unjudged, found = [f'{kind}: {or_else}, or {text}: this motion does not tell'
@@ -229,9 +230,8 @@ class Causes:
 
 def _difference(found: Reals) -> Finding | None:
     delay = -float(found[-1])
-    return Finding('finite_differences', 'the acceleration, without gravity, is that of '
-                   f'{delay:.3g} steps before, as a difference of two velocities',
-                   delay) if 0.25 < delay < 0.8 else None
+    return Finding('finite_differences', 'the acceleration, without gravity, is a difference of '
+                   f'velocities {delay:.3g} steps ago', delay) if 0.25 < delay < 0.8 else None
 
 
 def _split_arm(found: Reals) -> Finding | None:
