@@ -134,6 +134,7 @@ def assert_same(found, expected):
 @examples(4)
 @given(EVENTS, st.integers(0, 999))
 @example([(25 * MILLISECOND, act) for act in ACTS], 2)
+@example([(0, 'slow'), (49 * MILLISECOND, 'rates'), (1, 'epoch')], 2)
 def test_any_division_of_a_run_gives_the_same_bytes(name, events, seed):
     dice = random.Random(seed)      # how often it is thrown depends on the clock
     whole = go(simulate(RUNS[name]), events, at_once)

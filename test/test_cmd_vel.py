@@ -44,6 +44,7 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     drive(simulation, 0.0, 0.8, 0.0)                # to repeat it only lasts longer
     (event,) = simulation.history
     assert (event.t_ns, event.details['stop_ns']) == (S, 5 * S // 2)
+    assert not type(event)('drive', 5 * S // 2, 0, event.details).repeats(event), 'it brakes then'
     assert simulation.trajectory.starts(S + S // 2, 2 * S) == []
     position, velocity = goes_to(simulation, 10 * S)
     # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.

@@ -184,8 +184,8 @@ def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
         with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
             act()
     assert run.ticks(5).simulation.now_ns == stands_at
-    run.simulation.log_to(None)         # also where nobody takes messages
-    run.loop.reset(run.values)
-    assert reason in run.ticks(400).loop.failure
     run.loop.reset(simulate().values_at_start)
     assert run.loop.failure is None and run.ticks(404).simulation.now_ns > stands_at
+    run.simulation.log_to(None)         # also where nobody takes messages
+    run.loop.reset(run.values)
+    assert reason in run.ticks(400).loop.failure and run.simulation.now_ns == stands_at

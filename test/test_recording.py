@@ -36,9 +36,9 @@ from spinning_top_sim.recording.recorder import Recorder, single
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, qos_profiles
 
 
-def record(path, messages, **options):
+def record(path, messages, topics=TOPICS, metadata=METADATA.copy, **options):
     with closing(Recorder(
-            str(path), TOPICS, METADATA.copy, **{'min_free_bytes': 0} | options)) as recorder:
+            str(path), topics, metadata, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             recorder.write([single(*message)])
         recorder.close()
@@ -91,7 +91,7 @@ def test_mcap_and_rosbags_read_every_message(tmp_path, compression):
 @pytest.mark.parametrize('count', [0, 101])
 def test_channels_and_the_metadata_of_the_bag_are_those_of_rosbag2(tmp_path, monkeypatch, count):
     monkeypatch.setenv('ROS_DISTRO', 'kilted')
-    path = tmp_path / 'a "b": #ü.mcap'
+    path = tmp_path / 'a "b": #ü\udcff.mcap'      # the last one is no text
     assert record(path, some_messages(count)).written[0] == count
     with open(path, 'rb') as file:
         reader = make_reader(file)
@@ -100,7 +100,7 @@ def test_channels_and_the_metadata_of_the_bag_are_those_of_rosbag2(tmp_path, mon
     assert profile == 'ros2' and metadata['spinning_top_sim'].items() >= METADATA.items()
     bag = yaml.safe_load(metadata['rosbag2']['serialized_metadata'])
     expected = {'version': 9, 'storage_identifier': 'mcap', 'ros_distro': 'kilted',
-                'message_count': count, 'relative_file_paths': [path.name],
+                'message_count': count, 'relative_file_paths': ['a "b": #ü?.mcap'],
                 'starting_time': {'nanoseconds_since_epoch': EPOCH_NS if count else 0},
                 'duration': {'nanoseconds': max(0, count - 1) * 1_000_000}}
     assert {name: bag[name] for name in expected} == expected
@@ -221,11 +221,14 @@ def test_a_file_that_is_deleted_and_a_disk_that_fills_end_a_recording(
 
 def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeypatch):
     """In a folder, which a name with a slash makes, it is a date."""
+    forgotten = []
+    monkeypatch.setattr(recorder_module.atexit, 'unregister', forgotten.append)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('HOME', str(tmp_path))
     (tmp_path / 'old').mkdir()
     dated = r'spinning_top_\d{4}(-\d\d){2}_\d\d(-\d\d){2}_\d{6}\.mcap'
     for uri, path in (('run.mcap', r'run\.mcap'), ('new/er/', f'new/er/{dated}'),
-                      ('old', f'old/{dated}'), ('', dated), ('', dated)):
+                      ('~/old', f'old/{dated}'), ('', dated), ('', dated)):
         recorder = record(uri, [])
         assert re.fullmatch(f'{tmp_path}/{path}', str(recorder.path))
         with LogReader(recorder.path) as reader:
@@ -235,10 +238,8 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
                         ('none/a.mcap', 'No such file or directory')):
         assert record(uri, []).error == f'cannot write {tmp_path}/{uri}: {reason}'
     assert 'run.mcap' in record('run.mcap/', []).error
-    twice = Recorder('twice.mcap', [TOPICS[0], TOPICS[0]], dict)
-    twice.close()
+    twice = record('twice.mcap', [], [TOPICS[0], TOPICS[0]])
     assert twice.error == "topic '/top/pose' is listed twice: once is allowed"
-    long = Recorder('long.mcap', TOPICS, lambda: {'history': MAX_BYTES * ' '})
-    long.close()
+    long = record('long.mcap', [], metadata=lambda: {'history': MAX_BYTES * ' '})
     assert 'too many events' in long.error and not (tmp_path / 'long.mcap').exists()
-    assert (tmp_path / 'run.mcap').read_bytes() == content
+    assert (tmp_path / 'run.mcap').read_bytes() == content and len(forgotten) == 10

@@ -28,7 +28,9 @@ def recorded(node):
     assert node.switch('record', False).success
     path = node.get('record.uri')[0]
     assert verified(path)['identical']
-    return log_of(path)[0]
+    log, metadata = log_of(path)
+    assert '"pose.rate": 100.0' in metadata['spinning_top_sim']['parameters'], 'at the start'
+    return log
 
 
 def as_parameters(node, l3, lz):
@@ -38,7 +40,7 @@ def as_parameters(node, l3, lz):
 @pytest.mark.parametrize(('command', 'l3', 'lz'), [
     (OwnNode.command, 1.25, 0.75), (as_parameters, 2, 0)])
 def test_a_command_sets_the_momenta(node, command, l3, lz):
-    assert node.switch('record', True).success
+    assert node.set(pose__rate=50.0).successful and node.switch('record', True).success
     node.step(50)
     command(node, l3, lz)
     assert node.get('spin.l3', 'spin.lz') == [l3, lz]
@@ -123,6 +125,7 @@ def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
     assert node.get('solver.rtol', 'imu.gyroscope_noise_density', 'duration') == [1e-9, 5e-5, 0.0]
     assert list(node.get('imu.lever_arm')[0]) == [0.01, 0.0, 2.0]
     assert {*node.node.timers} == timers, 'ticks go on as before'
+    assert node.set(tick_rate=250.0).successful and len({*node.node.timers}) == len(timers)
 
 
 def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node):

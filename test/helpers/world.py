@@ -27,7 +27,7 @@ from spinning_top_sim.streams.topics import resolve_topic
 
 DATE_NS, SOURCE_NS = 1_700_000_000 * SECOND, 500 * SECOND
 FASTEST = 3e4               # [rad/s]; the steps and the increments of faster motions take minutes
-QUIET_NS = 60 * MILLISECOND     # at the end, in which nothing happens
+QUIET_NS = 63 * MILLISECOND     # at the end, in which nothing happens; it ends between ticks
 QUEUE_BYTES = 20_000        # of the recorder, so that it is full sooner
 MOST_QUEUED = 10_000        # messages: a chunk, the queue, and what one tick may add
 NO_EXIT = SimpleNamespace(register=lambda act: None, unregister=lambda act: None)
@@ -44,14 +44,15 @@ class Place(NamedTuple):
 class Log(recorder.Recorder):
     """A recorder that keeps what it is handed, and from where to where in the run."""
 
-    def __init__(self, uri, topics, *arguments, world, **options):
+    def __init__(self, uri, topics, metadata, *, world, **options):
         self.names, self._world = [topic.name for topic in topics], world
         self.file = Path(uri).absolute()
         self.handed = []            # steady time [ns], topic, log time [ns] and data of each,
         self.boundaries = {0}       # and how many there were after a call of `write`
         self.begins, self.ends = world.place, None
         world.logs.append(self)
-        super().__init__(uri, topics, *arguments, **options)
+        super().__init__(uri, topics, lambda: world.machine.sleep(5 * MILLISECOND) or metadata(),
+                         **options)
 
     def write(self, rows):
         for number, stamps_ns, messages in rows:
@@ -307,9 +308,9 @@ class World:
         self.wanted = dict.fromkeys(self.wanted, 'heard')
         self._lost_ticks = 0
         self._tick_until(max(machine.now_ns, self._cost_until_ns, self._stops_at_ns) + QUIET_NS)
+        assert self.recording.has_room() or self.disk.is_disturbed, 'a full queue is emptied'
         self._tick()
         self._check_time(is_quiet=True)
-        assert self.recording.has_room() or self.disk.is_disturbed, 'a full queue is emptied'
         before_ns, had_room = self.simulation.sent_ns, self.recording.has_room()
         self._tick_until(machine.now_ns + QUIET_NS)
         # Simulated time may be held before the stamp of t = 0.
