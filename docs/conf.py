@@ -57,7 +57,7 @@ numpydoc_validation_checks = {'PR01', 'PR02', 'PR03', 'PR04', 'PR07', 'RT03', 'Y
 # Made by solvers; a protocol; what others describe or extend; fields that have comments.
 numpydoc_validation_exclude = {
     r'\.States$', r'\.Filter$', r'\.Filter\.update$', r'\.Body$', r'\.Start$',
-    r'\.Description$', r'\.LogTopic$', r'\.LogMessage$'}
+    r'\.Description$', r'\.LogTopic$', r'\.LogMessage$', r'\.Scene$'}
 
 html_theme = 'furo' if installed('furo') else 'alabaster'
 html_title = f'{project} {release}'

@@ -39,7 +39,7 @@ DENSITIES = {'gyroscope': 'gyroscope_noise_density',
 @dataclass(frozen=True, kw_only=True)
 class Imu:
     """
-    An IMU on a body, as far as it is known.
+    An IMU on a body, as far as it is known.  ValueError: a value is not as below.
 
     Parameters
     ----------
@@ -52,8 +52,6 @@ class Imu:
     gyroscope_noise_density, accelerometer_noise_density : float, optional
         Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
         sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
-
-    Raises ValueError, which names the field, its value and what is allowed.
     """
 
     lever_arm: tuple[float, float, float] | None = None

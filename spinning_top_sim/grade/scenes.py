@@ -69,11 +69,11 @@ class Start(State):
 
 @dataclass(frozen=True)
 class Scene:
-    """A motion of a duration [s] that is graded."""
+    """A motion that is graded."""
 
-    name: str
+    name: str               # in reports
     start: State
-    duration: float
+    duration: float         # [s]
 
 
 # The bicycle wheel of config/cusp.yaml, with an IMU off its axis.
