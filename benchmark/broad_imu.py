@@ -36,7 +36,7 @@ def told(found: Report, *names: str) -> str:
     """Return marks with their intervals; a dash where one cannot be told."""
     marks = [found.marks[name] for name in names]
     return ', '.join('–' if not np.isfinite(mark.value) or 'inf' in mark.meaning else
-                     f'{mark.value:.4g} {mark.meaning.replace("+-", "±")}' for mark in marks)
+                     f'{mark.value:.4g} ± {mark.meaning.split()[1]}' for mark in marks)
 
 
 def main() -> None:
@@ -62,7 +62,8 @@ TEXT = """\
 [The grade](../grade.md) of trials of [BROAD](https://doi.org/10.3390/data6070072): poses by
 cameras, a real IMU at 286 Hz. `matrix` is what the gyroscope reads of the rates of the poses,
 along each axis; intervals are those of 95 %, a dash is what the motion cannot tell. The gyroscope
-lags behind the poses by the same time in every trial: it is a property of the recording.
+lags behind the poses by the same time, 4 ms, in every trial: it is a property of the recording,
+and told as `late`, for it is more than a sample.
 """
 
 
