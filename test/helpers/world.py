@@ -308,6 +308,8 @@ class World:
         self.wanted = dict.fromkeys(self.wanted, 'heard')
         self._lost_ticks = 0
         self._tick_until(max(machine.now_ns, self._cost_until_ns, self._stops_at_ns) + QUIET_NS)
+        if not self.recording.has_room():
+            machine.sleep(QUIET_NS)     # a tick that catches up has just filled the queue
         assert self.recording.has_room() or self.disk.is_disturbed, 'a full queue is emptied'
         self._tick()
         self._check_time(is_quiet=True)
