@@ -102,9 +102,11 @@ def gyroscope(exam: Exam) -> Measured:
         for k, column in enumerate(matrix.T) if off[k] > GAIN_OFF))
 
 
-def at_rest(exam: Exam) -> Measured:
+def at_rest(exam: Exam) -> Measured | None:
     """Judge where new filters come to rest: no estimate of a bias explains an error there."""
     settled = [exam.ours(one) for one in exam.starts if measures.settled(one.estimates, STILL)]
+    if not settled:
+        return None
     tilt, whole = (_at_rest(settled, slice(axes)) for axes in (2, 3))
     if tilt > CLEAN_DEG:        # by the field?
         tilt = min(tilt, _at_rest(exam.outcomes('starts, no field', lambda: [
@@ -146,7 +148,7 @@ def steps(exam: Exam) -> Measured:
     limit = max(GAIN_OFF, EXPLAINED * abs(gain - 1.0))
     evidence = (f'a turn in a step of {1e3 * STEPS[worst]:g} ms is {off:.3g} of it off one as '
                 f'fast in {1e3 / RATE:g} ms')
-    if left > EXPLAINED * off:
+    if off > limit and left > EXPLAINED * off:
         return Measured(off, f'{evidence}: by no factor', 'accuracy', max(limit, EXPLAINED))
     return Measured(off, f'{evidence}: the length is misused', limit=limit)
 
@@ -296,8 +298,8 @@ def _in_degrees(rates: Reals) -> str:
 
 def _at_rest(outcomes: Sequence[Outcome], axes: slice) -> float:
     """Return the largest error about axes of the world in the end of these rests [deg]."""
-    return math.degrees(max((float(np.linalg.norm(measures.turns(
-        one.run.truth[-1], one.estimates[-1])[axes])) for one in outcomes), default=0.0))
+    return math.degrees(max(float(np.linalg.norm(measures.turns(
+        one.run.truth[-1], one.estimates[-1])[axes])) for one in outcomes))
 
 
 def _of_bias(outcome: Outcome) -> list[tuple[list[int], NDArray[np.intp]]]:

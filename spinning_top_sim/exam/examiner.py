@@ -131,7 +131,7 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
             continue
         limit = check.limit if measured.limit is None else measured.limit
         marks |= {check.mark: Mark(measured.value, limit, check.meaning), **measured.others}
-        if measured.value > limit:
+        if measured.value > limit or math.isnan(measured.value):
             found.append(Finding(measured.name or check.fault, measured.evidence, measured.value))
     show(len(CHECKS), len(CHECKS))
     notes = [f'not judged because of this: {", ".join(left_out)}'] if left_out else []

@@ -151,8 +151,7 @@ class Exam:
         """
         Return kicks about the vertical (n, 3), and how they move attitudes (n, ANSWER, 3).
 
-        size : of a kick in a step of 1 / RATE [rad], small even for a filter that reads degrees;
-            in other steps it is as fast
+        size : of a kick in 1 / RATE [rad], small in degrees, too; in other steps it is as fast
         lengths : of the steps, one in the end of each rest [s]
         """
         steps, still, run = self.ends - ANSWER, self.still.estimates, self.run.without_field()
