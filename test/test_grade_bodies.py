@@ -142,6 +142,7 @@ T, W = PARTS['gyroscope']
     ({'gyroscope': (W, T)}, 'gyroscope of shape (200,): must have shape (n, 3)'),
     ({'gyroscope': (T[1:], W)}, 'times of gyroscope of shape (199,): must have shape (200)'),
     ({'gyroscope': (T, 0.0 * W + np.nan)}, 'gyroscope[0, 0] = nan: must be finite'),
+    ({'gyroscope': (T, np.ma.array(W, mask=True))}, 'gyroscope[0, 0] = nan: must be finite'),
     ({'gyroscope': (1e9 * T, W)}, '200 rows of gyroscope, 1e+07 s apart: must be 20 at least'),
     ({'gyroscope': (100.0 + T, W)}, 'must be of one clock'),
     ({'attitudes': (T, np.ones((200, 4)))}, 'attitudes[0]: |q| = 2: must be 1')])

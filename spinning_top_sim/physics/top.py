@@ -184,7 +184,7 @@ def numbers(name: str, values: Any, *shape: int | str) -> NDArray[np.float64]:
     """Return finite numbers of a shape, in which a letter is any length.  Raises ValueError."""
     array = np.array(math.nan)
     with suppress(TypeError, ValueError):
-        array = np.array(values, dtype=float)
+        array = np.array(np.ma.filled(values, math.nan), dtype=float)     # masked: none
     if array.ndim != len(shape) or any(
             isinstance(one, int) and one != has for one, has in zip(shape, array.shape,
                                                                     strict=True)):
