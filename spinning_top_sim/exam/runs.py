@@ -142,9 +142,9 @@ class Exam:
     def kicks_of_tilt(self, start: Sequence[float], axes: tuple[int, int]) -> list[Outcome]:
         """Return new filters at rest with a kick about each of two axes, and without one."""
         run = Motion(start).rest((self.lead + BACK) / RATE).run('tilt').without_field()
-        rates = np.repeat(run.gyroscope[np.newaxis], 3, axis=0)
-        rates[[0, 1], -BACK, axes] += SMALL * RATE
-        return self.outcomes(str(start), lambda: [replace(run, gyroscope=one) for one in rates])
+        fed = np.repeat(run.gyroscope[np.newaxis], 3, axis=0)
+        fed[[0, 1], -BACK, axes] += SMALL * RATE
+        return self.outcomes(f'{start}{axes}', lambda: [replace(run, gyroscope=one) for one in fed])
 
     def answers(self, size: float = 0.6 * SMALL,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
