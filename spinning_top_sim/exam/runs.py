@@ -144,7 +144,7 @@ class Exam:
         run = Motion(start).rest((self.lead + BACK) / RATE).run('tilt').without_field()
         fed = np.repeat(run.gyroscope[np.newaxis], 3, axis=0)
         fed[[0, 1], -BACK, axes] += SMALL * RATE
-        return self.outcomes(f'{start}{axes}', lambda: [replace(run, gyroscope=one) for one in fed])
+        return self.outcomes(f'{start}{axes}', lambda: [replace(run, gyroscope=g) for g in fed])
 
     def answers(self, size: float = 0.6 * SMALL,
                 lengths: Reals | float = 1.0 / RATE) -> tuple[Reals, Reals]:
