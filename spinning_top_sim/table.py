@@ -21,6 +21,7 @@ from spinning_top_sim.installation import needed
 FilePath = str | Path
 Columns = Mapping[str, Sequence[Any]]           # numbers, or texts, by name
 NUMBER = re.compile(r'[-+]?[\d.]+([eE][-+]?\d+)?')
+NUMBERS = re.compile(rf'({NUMBER.pattern}[,;\s]+){{2}}')         # how a line of them begins
 
 # Names and units of the columns of a table; the second one is for a pivot that moves.
 UNITS = {
@@ -87,7 +88,8 @@ def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
         raise ValueError('must be .mcap, or a table .csv, .txt, .tum, .tsv, .parquet or .npz')
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f'two columns are called {name}: each needs a name of its own')
+            raise ValueError(f'two columns are called {name}: each needs a name of its own; '
+                             'without a line of names they are column 1, column 2, ...')
     lengths = {len(column) for column in columns}
     if len(lengths) > 1:
         raise ValueError(f'columns have {sorted(lengths)} rows: must have as many')
@@ -117,7 +119,10 @@ def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:
         del rows[next(iter(rows))]
     for where, row in rows.items():
         if len(row) != len(names):
+            begin = next((k for k, line in enumerate(bare, 1) if NUMBERS.match(line)), 0)
+            above = (f'; numbers begin in line {begin}: keep it and a line of names, as by '
+                     f'tail -n +{begin - 1}') * (begin > int(where[5:]))
             raise ValueError(f'{where} has {len(row)} values, and there are {len(names)} columns: '
-                             'must be as many, with decimal points; comments begin with #')
+                             f'must be as many, with decimal points; comments begin with #{above}')
     return ([name or f'column {k}' for k, name in enumerate(names, 1)],
             [[row[k] for row in rows.values()] for k in range(len(names))], [*rows])

@@ -251,8 +251,8 @@ ONE_BY_ONE = 'rosbag2 has compressed its messages one by one'
     (lambda path: path.write_bytes(b''), 'it is empty'),
     (lambda path: path.write_bytes(b'SQLite format 3\x00' + bytes(100)), 'it is no MCAP file'),
     (lambda path: None, 'No such file or directory'), (os.mkfifo, 'it is no regular file'),
-    (os.mkdir, 'a folder must hold one .mcap file, not 0'),
-    (lambda path: write_bag(path, split=3), 'a folder must hold one .mcap file, not 3'),
+    (os.mkdir, 'a folder must have one .mcap file, not 0'),
+    (lambda path: write_bag(path, split=3, lost=1), 'a folder must have one .mcap file, not 3'),
     (lambda path: write_bag(path, 'FILE'), 'it is compressed as a whole, unpack it by zstd -d'),
     # The mode is told by a record in the file, or by metadata.yaml beside it.
     (lambda path: write_bag(path, 'MESSAGE'), ONE_BY_ONE),

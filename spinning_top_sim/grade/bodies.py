@@ -2,7 +2,7 @@
 """Grades the IMU of any rigid body against its poses; no top is needed."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -68,6 +68,8 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *,
 def _checked(told: Parts) -> Parts:
     """Return parts as those of a file are.  Raises ValueError."""
     recorded = Recorded()
+    if not isinstance(told, Mapping):
+        raise ValueError(f'parts of type {type(told).__name__}: must be a mapping')
     for name, pair in told.items():
         width = len(PARTS[known(name, [*PARTS][1:])][0])
         if not isinstance(pair, tuple | list) or len(pair) != 2:

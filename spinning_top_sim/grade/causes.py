@@ -167,6 +167,9 @@ class Causes:
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
         if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
             return None
+        for unit, size in columns.LENGTHS.items() if term == 'linear' else ():
+            if abs(share - size) + self.model.fit([term]).sigma[-1] < LIKE * size:
+                return Finding('units', f'{text}, as of positions in {unit}', share)
         if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
             return Finding(TERMS[term], text, share)
         if share < 0.0:

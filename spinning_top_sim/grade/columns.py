@@ -23,7 +23,8 @@ LAGS = range(-5, 41)    # that are tried [samples]
 EXACT = 1e-5            # share of a reading that differences of poses may leave
 # Terms and effects that any reading may have, along any axes.
 ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field', 'rates'
-# Units of readings with their sizes, SI first.
+# Units with their sizes: of positions, but for m; of readings, SI first.
+LENGTHS = {'cm': 1e-2, 'mm': 1e-3}
 READINGS: dict[str, Mapping[str, float]] = {
     'gyroscope': {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0,
                   'dps': math.pi / 180.0, 'rpm': math.pi / 30.0},

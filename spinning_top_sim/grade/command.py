@@ -7,8 +7,8 @@ Grade a recording: is this IMU that of this motion?  Of a top, is this motion ri
   spinning-top grade run.csv --scene looping        # also the motion of a top that is known
 
 exit codes:
-  0    no fault was found
-  1    there are faults, or the file cannot be read
+  0    no fault was found in what was judged
+  1    there are faults, nothing was judged, or the file cannot be read
   2    wrong arguments, or a file that is not understood
   130  interrupted
 docs/grade.md says what a file may contain.
@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade.bodies import grade_readings
-from spinning_top_sim.grade.columns import DENSITIES, READINGS, STANDARD_GRAVITY, Imu
+from spinning_top_sim.grade.columns import DENSITIES, READINGS, Imu
 from spinning_top_sim.grade.files import Recorded, read
 from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.grade.simulators import EARLY, TOLERANCE, Judgement
@@ -61,7 +61,8 @@ def _run(arguments: argparse.Namespace) -> int:
     given: Mapping[str, Any] = scene_file.given(arguments)
     run = None if arguments.scene or arguments.params else recorded.run
     values = parameters.checked({**(run.values_in_effect if run else {}), **given})
-    of_top = bool(run) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
+    of_top = bool(run) or any(name.startswith(('top.', 'initial.', 'spin.'))
+                              for name in given.keys() - {'top.gravity'})
     parts, at = recorded.parts, recorded.parts['attitudes'][0]
     if not of_top and READINGS.keys().isdisjoint(parts):
         raise ValueError(f'{arguments.file}: nothing to grade: no top (--scene) and no readings '
@@ -74,7 +75,7 @@ def _run(arguments: argparse.Namespace) -> int:
               mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
               **{name: given.get(f'imu.{name}') for name in DENSITIES.values()})
     report = Report(arguments.file.name, notes=recorded.notes).plus(grade_readings(
-        parts, imu, gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY))
+        parts, imu, gravity=values['top.gravity']))
     if of_top:
         report = report.plus(_of_motion(recorded, values, run))
     return printed(report, arguments.json)

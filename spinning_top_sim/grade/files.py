@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from spinning_top_sim.grade.columns import NORM, READINGS
+from spinning_top_sim.grade.columns import LENGTHS, NORM, READINGS
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.table import Columns, read_columns
 from spinning_top_sim.times import NEVER_NS, stamp_text
@@ -33,7 +33,7 @@ from spinning_top_sim.tools.scene_file import likely_name
 PARTS: dict[str, tuple[Sequence[str], Mapping[str, Any]]] = {
     't': (['t'], {'s': 10 ** 9, 'ms': 10 ** 6, 'us': 10 ** 3, 'ns': 1}),
     'attitudes': (['qx', 'qy', 'qz', 'qw'], {'1': 1.0}),
-    'positions': (['px', 'py', 'pz'], {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}),
+    'positions': (['px', 'py', 'pz'], {'m': 1.0, **LENGTHS}),
     **{name: ([f'{letter}{axis}' for axis in 'xyz'], READINGS[name])
        for name, letter in zip(READINGS, 'gam', strict=True)}}
 UNITS = {name: units for names, units in PARTS.values() for name in names}
@@ -46,6 +46,7 @@ OF_TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
 TUM = ['timestamp', 'tx', 'ty', 'tz', *OF_TUM[4:]], [f'column {k}' for k in range(1, 9)]
 EUROC = {'timestamp': 't [ns]', **{f'{theirs}_{axis}': f'{ours}{axis}' for theirs, ours in (
     ('p_RS_R', 'p'), ('q_RS', 'q'), ('w_RS_S', 'g'), ('a_RS_S', 'a')) for axis in 'wxyz'}}
+OF_IMU = re.compile(r'^/.*:|/sensor.yaml$')     # transforms to other frames
 OF_EUROC = 'state_groundtruth_estimate0/data.csv', 'imu0/data.csv'
 # Topics of this package that are graded where its log has them, the first of each kind.
 OURS = 'pose', 'ground_truth/odom', 'ground_truth/imu', 'imu/data_raw', 'imu/data', 'imu/mag'
@@ -76,8 +77,7 @@ class Recorded:
         steps, same = np.diff(times), np.all(np.diff(values[at], axis=0) == 0.0, axis=1)
         for k in np.flatnonzero((steps < 0.0) | ((steps == 0.0) & ~same))[:1]:
             raise ValueError(f'{rows[at[k + 1]]}: {kind} are at {times[k + 1]:.9g} s after '
-                             f'{times[k]:.9g} s: must ascend, one motion a file, with enough '
-                             'digits')
+                             f'{times[k]:.9g} s: must ascend, one motion a file, all digits')
         once = np.append(True, steps > 0.0)[:len(at)]
         if not np.all(once):
             self.notes.append(f'{kind}: {np.sum(~once)} rows are there twice: used once')
@@ -114,9 +114,8 @@ def unit(attitudes: Reals, rows: Sequence[str]) -> Reals:
 def known(name: Any, allowed: Collection[str]) -> str:
     """Return a name.  ValueError, with a hint: it is not allowed."""
     if name not in allowed:
-        alike = [one for one in allowed if one[:3] == str(name)[:3]] or allowed
         raise ValueError(f'{name!r}: must be one of {", ".join(allowed)}'
-                         f'{likely_name(str(name), alike)}')
+                         f'{likely_name(str(name), allowed)}')
     return str(name)
 
 
@@ -147,6 +146,8 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
                 table = dict(zip(OF_TUM, table.values(), strict=True))
             unused = _add(recorded, table, rows, columns_said(columns or ''))
         recorded.notes += [f'not used: {", ".join(unused)}'] * bool(unused)
+        if not recorded.run and any(map(OF_IMU.search, unused)):
+            recorded.notes.append('only --lever-arm and -p imu.rpy say where the IMU is')
         recorded.check()
     except (ValueError, EOFError, csv.Error, BadZipFile) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error

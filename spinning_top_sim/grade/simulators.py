@@ -38,7 +38,7 @@ SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
           scenes: Sequence[Scene] = SCENES, tolerance: float = TOLERANCE) -> Report:
     """
-    Grade a simulator.  ValueError: an argument, or dt so long that no scene can be graded.
+    Grade a simulator.  ValueError: dt or tolerance is not positive.
 
     Parameters
     ----------
@@ -73,9 +73,6 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
                 judgement.add(scene.name, start, told_motion(run, body, start, times, dt))
             except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
-    if len(unjudged) == len(scenes):
-        raise ValueError(f'dt = {dt!r} s, {len(scenes)} scenes: must have one in which the top '
-                         f'turns by at most {MOST:g} rad in a step')
     subject = one_line(getattr(run, '__name__', type(run).__name__))
     unjudged += [f'{name}: there is none' for name in DENSITIES for motion in judgement.motions[:1]
                  if name not in motion.told.readings]
@@ -178,7 +175,9 @@ def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(
             'inertia_frame', 'the moments of inertia are about axes of the world')),
-        Cause(['damping', 'axis damping'], _damping),
+        Cause(['damping', 'axis damping'], lambda found: Finding(
+            'damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the axis '
+            f'and {found[1]:.3g} 1/s about it', float(found[0]))),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
     return found if rest.rest < UNEXPLAINED * model.size(TARGET) else []
@@ -223,11 +222,6 @@ def _step(found: Reals) -> Finding:
             'explicit_gyroscopic_term' if at > -0.5 else 'coriolis_sign')
     return Finding(name, f'in the mean, the gyroscopic term is taken at {at:.3g} of a step, '
                    f'gravity at {gravity_at:.3g}; right is 0.5', at)
-
-
-def _damping(found: Reals) -> Finding:
-    return Finding('damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the '
-                   f'axis and {found[1]:.3g} 1/s about it', float(found[0]))
 
 
 def _com(body: Body, found: Reals) -> Finding:

@@ -189,7 +189,8 @@ def numbers(name: str, values: Any, *shape: int | str) -> NDArray[np.float64]:
             isinstance(one, int) and one != has for one, has in zip(shape, array.shape,
                                                                     strict=True)):
         is_of = f'shape {array.shape}' if array.ndim else f'type {type(values).__name__}'
-        raise ValueError(f'{name} of {is_of}: must have shape ({", ".join(map(str, shape))})')
+        said = str(shape).replace("'", '')
+        raise ValueError(f'{name} of {is_of}: must have shape {said}')
     for at in np.argwhere(~np.isfinite(array))[:1]:
         raise ValueError(f'{name}{at.tolist()} = {array[*at]}: must be finite')
     return array

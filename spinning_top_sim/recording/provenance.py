@@ -36,8 +36,7 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
         # One by one, so that other threads get their turn.
-        'history': f'[{", ".join(json.dumps(event, default=list) for event in history)}]',
-    }
+        'history': f'[{", ".join(json.dumps(event, default=list) for event in history)}]'}
 
 
 def environment() -> dict[str, str]:
@@ -48,8 +47,7 @@ def environment() -> dict[str, str]:
                     f'{platform.python_implementation()} {platform.python_version()} '
                     f'{sys.byteorder}{_vectors()}',
         'libraries': json.dumps({name: found for name in LIBRARIES
-                                 if (found := version(name)) != 'unknown'}),
-    }
+                                 if (found := version(name)) != 'unknown'})}
 
 
 def _vectors() -> str:

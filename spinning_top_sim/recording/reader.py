@@ -8,6 +8,7 @@ Lengths lead from record to record, so that no index is needed.
 import contextlib
 import itertools
 import os
+import re
 import struct
 import zlib
 from bisect import bisect_left
@@ -109,8 +110,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.torn, self.lost_bytes, self.changed = False, 0, False
-        self._places: list[Place] = []
-        self._attached: list[Place] = []        # metadata and attachments
+        # Of messages; of metadata and attachments.
+        self._places, self._attached = list[Place](), list[Place]()
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
@@ -373,10 +374,13 @@ def _unpacked(chunk: Chunk, max_bytes: int) -> bytes:
 
 
 def _file_of(path: Path) -> Path:
-    """Return a file, or the one in a folder; raises LogError."""
+    """Return a file, or the one in a folder, and in its metadata.yaml; raises LogError."""
     if not path.is_dir():
         return path
     files = sorted([*path.glob('*.mcap')] or path.glob('*.mcap.*'))
-    if len(files) != 1:
-        raise LogError(f'cannot read {path}: a folder must hold one .mcap file, not {len(files)}')
+    text = ''.join(one.read_text(errors='replace') for one in path.glob('metadata.yaml'))
+    count = max(len(files), len({*re.findall(r'[^\s/"\']+\.mcap', text)}))    # some may be missing
+    if count != 1:
+        raise LogError(f'cannot read {path}: the bag in a folder must have one .mcap file, not '
+                       f'{count}: `ros2 bag convert` makes one')
     return files[0]

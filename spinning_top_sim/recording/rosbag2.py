@@ -90,10 +90,8 @@ def _understood(policy: str, value: Any) -> Any:
 
 def has_compressed_messages(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> bool:
     """Return whether rosbag2 has compressed the messages of a log one by one."""
-    text = metadata.get(BAG_METADATA, {}).get('serialized_metadata', '')
-    beside = path.with_name('metadata.yaml')
-    if not text and beside.is_file():
-        text = beside.read_text(errors='replace')
+    text = metadata.get(BAG_METADATA, {}).get('serialized_metadata') or ''.join(
+        one.read_text(errors='replace') for one in path.parent.glob('metadata.yaml'))
     return bool(re.search(r'^[ \t]*compression_mode:[ \t]*["\']?message', text, re.M | re.I))
 
 

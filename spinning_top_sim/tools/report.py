@@ -81,8 +81,8 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether no fault was found, in what was judged."""
-        return not self.found
+        """Whether something was judged, and no fault found in it; see `unjudged`."""
+        return bool(self.marks) and not self.found
 
     @property
     def faults(self) -> list[str]:
@@ -103,8 +103,9 @@ class Report:
                        unjudged=[one for report in every for one in report.unjudged])
 
     def __str__(self) -> str:
-        right = 'no fault found in what was judged' if self.unjudged else 'passed'
-        lines = [f'{self.subject}: {", ".join(self.faults) or right}',
+        right = 'passed, in what was judged' if self.unjudged else 'passed'
+        verdict = ', '.join(self.faults) or (right if self.passed else 'nothing was judged')
+        lines = [f'{self.subject}: {verdict}',
                  *(f'  not judged: {one}' for one in self.unjudged),
                  *(f'  {finding.name}: {finding.evidence}' for finding in self.found),
                  *(f'  {note}' for note in self.notes)]
@@ -137,10 +138,9 @@ class Report:
                     for name, value in one._asdict().items()}
 
         return json.dumps({
-            'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-            'found': [*map(told, self.found)],
-            'marks': {name: told(mark) for name, mark in self.marks.items()},
-            'notes': list(self.notes), 'unjudged': list(self.unjudged)}, indent=2)
+            'subject': self.subject, 'passed': self.passed, 'unjudged': list(self.unjudged),
+            'faults': self.faults, 'found': [*map(told, self.found)], 'notes': list(self.notes),
+            'marks': {name: told(mark) for name, mark in self.marks.items()}}, indent=2)
 
 
 def _number(value: float) -> str:

@@ -120,14 +120,14 @@ def write_stranger(path, options, count=300):
     return messages
 
 
-def write_bag(folder, mode='', split=1, *, record=True):
-    """Write what matters of a bag as rosbag2 does, with ten strings."""
+def write_bag(folder, mode='', split=1, lost=0, *, record=True):
+    """Write what matters of a bag as rosbag2 does, with ten strings, but for the lost files."""
     folder.mkdir()
     about = f"compression_format: zstd\ncompression_mode: '{mode}'\n"
     texts = [b'\0\1\0\0\x06\0\0\0text%d\0' % number for number in range(10)]
     rows = [(0, number, zstandard.compress(text) if mode == 'MESSAGE' else text)
             for number, text in enumerate(texts)]
-    for part in range(split):
+    for part in range(split - lost):
         path = write_rows(
             folder / f'{folder.name}_{part}.mcap',
             [RecordedTopic('/said', 'std_msgs/msg/String')], rows,
@@ -136,4 +136,4 @@ def write_bag(folder, mode='', split=1, *, record=True):
             packed = zstandard.compress(path.read_bytes())
             path.rename(f'{path}.zstd').write_bytes(packed)
     (folder / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  ' + about.replace(
-        '\n', '\n  '))
+        '\n', '\n  ') + ''.join(f'- {folder.name}_{part}.mcap\n' for part in range(split)))
