@@ -116,6 +116,7 @@ def test_what_is_held_is_named_and_not_graded():
 def test_what_is_too_fast_is_left_out_and_what_cannot_be_seen_is_no_fault():
     report = grade(Imu(), scenes=SCENES[-2:], dt=1.0 / 60.0)
     assert report.passed and 'not judged: fast spin' in str(report), report
+    assert not grade(Imu(), scenes=SCENES[-1:], dt=1.0 / 60.0).passed     # nothing is judged
     for theta, gravity in ((0.0, 9.8), (math.pi, -9.8), (0.0, 0.0)):
         spin = Scene('spin', State(theta=theta, l3=2.0, lz=2.0 * math.cos(theta)), 0.5)
         assert grade(Imu(), body=replace(WHEEL, gravity=gravity), scenes=[spin], dt=0.01).passed
@@ -179,10 +180,8 @@ def test_what_is_no_motion_is_told(said, says):
     (lambda: grade(Imu(), dt=0.0), 'dt = 0.0 s, tolerance = 0.001745'),
     (lambda: grade(Imu(), dt='0.1'), "dt = '0.1' s, tolerance"),
     (lambda: grade(Imu(), tolerance=-1.0), 'tolerance = -1.0 rad: must be positive'),
-    (lambda: grade(Imu(), dt=1.0), 'dt = 1.0 s, 6 scenes: must have one in which'),
-    (lambda: grade(Imu(), scenes=[]), '0 scenes: must have one in which'),
     (lambda: replace(WHEEL, mounting=(1.0, 1.0, 0.0, 0.0)), 'norm must be 1'),
-    (lambda: replace(WHEEL, lever_arm=(1.0, 2.0)), 'lever_arm of shape (2,): must have shape (3)'),
+    (lambda: replace(WHEEL, lever_arm=(1.0, 2.0)), 'of shape (2,): must have shape (3,)'),
     (lambda: replace(WHEEL, mass=-1.0), 'mass = -1.0 kg')])
 def test_wrong_arguments_are_refused(call, says):
     with pytest.raises(ValueError, match=re.escape(says)):

@@ -18,7 +18,7 @@ from spinning_top_sim.tools.conventions import Convention
 from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-EXCERPT = 2000          # samples of a motion by which a convention is found, to be fast
+EXCERPT = 1000          # samples of a motion by which a convention is found, to be fast
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.95    # of a hold: runs of equal rows, share of equal length

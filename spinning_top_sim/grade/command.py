@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'or a file with such a text')
     add('--topic', action='append', default=[], help='a topic of a log to read, of transforms '
         'TOPIC:CHILD; may be repeated; default: the only one of each kind')
-    add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+    add('--lever-arm', dest='arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
         help='position of the IMU in the body [m]; default: found')
     scene_file.add_parameters(parser)
     add('--json', action='store_true', help='print everything as JSON')
@@ -69,9 +69,8 @@ def _run(arguments: argparse.Namespace) -> int:
                          f"(--columns 'gx=COLUMN:UNIT, ...'); {'; '.join(recorded.notes)}")
     if of_top and not run:              # the pivot is at rest
         parts = {'positions': (at, np.zeros((len(at), 3))), **parts}
-    known = {name: values[name] for name in ('imu.lever_arm', 'mag.field') if run or name in given}
-    imu = Imu(lever_arm=arguments.lever_arm or known.get('imu.lever_arm'),
-              field=known.get('mag.field'),
+    known = values if run else given
+    imu = Imu(lever_arm=arguments.arm or known.get('imu.lever_arm'), field=known.get('mag.field'),
               mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
               **{name: given.get(f'imu.{name}') for name in DENSITIES.values()})
     report = Report(arguments.file.name, notes=recorded.notes).plus(grade_readings(

@@ -77,7 +77,7 @@ class Recorded:
         steps, same = np.diff(times), np.all(np.diff(values[at], axis=0) == 0.0, axis=1)
         for k in np.flatnonzero((steps < 0.0) | ((steps == 0.0) & ~same))[:1]:
             raise ValueError(f'{rows[at[k + 1]]}: {kind} are at {times[k + 1]:.9g} s after '
-                             f'{times[k]:.9g} s: must ascend, one motion a file, all digits')
+                             f'{times[k]:.9g} s: must ascend: one motion, enough digits')
         once = np.append(True, steps > 0.0)[:len(at)]
         if not np.all(once):
             self.notes.append(f'{kind}: {np.sum(~once)} rows are there twice: used once')
@@ -114,8 +114,9 @@ def unit(attitudes: Reals, rows: Sequence[str]) -> Reals:
 def known(name: Any, allowed: Collection[str]) -> str:
     """Return a name.  ValueError, with a hint: it is not allowed."""
     if name not in allowed:
+        alike = [one for one in allowed if one[:3] == str(name)[:3]] or allowed
         raise ValueError(f'{name!r}: must be one of {", ".join(allowed)}'
-                         f'{likely_name(str(name), allowed)}')
+                         f'{likely_name(str(name), alike)}')
     return str(name)
 
 
