@@ -173,7 +173,7 @@ def test_a_magnetometer_needs_no_field_and_its_faults_are_told():
     parts = {**told(moving), 'magnetometer': (moving.t, field)}
     report = grade_readings(parts)
     assert report.passed and abs(report.marks['field_y'].value - 20e-6) < 1e-9, report
-    for one, fault in ((1e6 * field, 'units'), (field @ SWAPPED, 'inaccurate'),
+    for one, fault in ((1e6 * field, 'units'), (field @ SWAPPED, 'axes'),
                        (2e4 * field, 'reading_scale'), (0.0 * field + field[0], 'inaccurate'),
                        (0.0 * field, 'reading_scale'), (np.add(field, (1e-5, 0.0, 2e-5)), 'bias')):
         assert grade_readings({**parts, 'magnetometer': (moving.t, one)}).faults == [fault]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.causes import CLEARLY, DENSITIES, OFFSETS, judge
+from spinning_top_sim.grade.causes import CLEARLY, DENSITIES, OFFSETS, cost, judge
 from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, UP, Comparison, Imu
 from spinning_top_sim.grade.files import PARTS, Recorded, known
 from spinning_top_sim.physics.top import numbers
@@ -19,8 +19,7 @@ from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stret
 from spinning_top_sim.tools.report import Finding, Report
 
 EXCERPT = 1000          # samples of a motion by which a convention is found, to be fast
-# Share of a reading left in ours, of that in another convention, and of the reading there.
-WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
+SMALL = 0.1             # share of a reading that another convention may leave
 HELD_RUNS, HELD_SHARE = 20, 0.95    # of a hold: runs of equal rows, share of equal length
 JUMP = 10.0             # times a step of poses is longer than those beside and than usual
 
@@ -55,14 +54,20 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *,
            if any(body.coarse for body in bodies) else '')
     if why:
         return Report('readings', faults, unjudged=[f'readings: {why}', *unjudged])
-    convention = convention_of(bodies, imu, gravity)
+
+    def judged(bodies: Sequence[Stretch]) -> Report:
+        return Report('readings', faults, unjudged=unjudged).plus(*(
+            judge(name, bodies, imu, gravity) if 'positions' in parts or name != 'accelerations'
+            else Report('', unjudged=[f'{name}: without positions'])
+            for name in READINGS if name in parts))
+
+    report = judged(bodies)
+    convention = convention_of(bodies, imu, gravity) if report.found else Convention()
     if convention.parts:
-        faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
-                              'undone'))
-        bodies = [undone(body, convention) for body in bodies]
-    return Report('readings', faults, unjudged=unjudged).plus(*(
-        judge(name, bodies, imu, gravity) if 'positions' in parts or name != 'accelerations' else
-        Report('', unjudged=[f'{name}: without positions']) for name in READINGS if name in parts))
+        other = judged([undone(body, convention) for body in bodies]).plus(Report('', [Finding(
+            'convention', f'attitudes are told as {convention.name}; this is undone')]))
+        return other if cost(other.found) < cost(report.found) else report
+    return report
 
 
 def _checked(told: Parts) -> Parts:
@@ -127,25 +132,22 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     widths = {name: [compared.motions[0][0].width] for name in ('gyroscope', 'accelerations')
               if (compared := Comparison(name, [body], imu, gravity)).motions}
 
-    def left(convention: Convention, most: float = math.inf, sign: float = 1.0) -> float:
+    def left(convention: Convention, most: float = math.inf) -> float:
         """Return the largest share of a reading that is left; more than `most` ends the search."""
         told, worst = undone(body, convention), 0.0
         for name, width in widths.items():
             if worst <= most:
-                compared = Comparison(name, [told], imu, sign * gravity, width)
+                compared = Comparison(name, [told], imu, gravity, width)
                 model = compared.model(0)
                 fit = model.fit(['total', *OFFSETS])
-                size = 1.0 + fit.found[len(compared.always)]
-                right = not model.clear('total', CLEARLY) or any(
-                    abs(size * unit - 1.0) < 0.1 for unit in compared.units.values())
-                worst = max(worst, fit.beyond if right else 1.0)
+                negative = fit.found[len(compared.always)] < -1.0
+                worst = max(worst, 1.0 if negative and model.clear('total', CLEARLY) else
+                            fit.beyond * (fit.beyond > 2.0 * fit.noise))
         return worst
 
-    before = left(ours)
-    enough = min(RIGHT * before, SMALL)
-    if before < WRONG or left(ours, sign=-1.0) < enough:
+    if left(ours) < WRONG:
         return ours
-    after = [left(one, enough) for one in others]
+    after = [left(one, SMALL) for one in others]
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(np.array(after) <= conventions.AS_GOOD * min(after) + 1e-6))
-    return others[best] if after[best] < enough else ours
+    return others[best] if after[best] < SMALL else ours

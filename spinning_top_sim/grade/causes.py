@@ -12,7 +12,6 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import columns
 from spinning_top_sim.grade.columns import AXES, DENSITIES, ENTRIES, OF_TURNS, Comparison, Imu
 from spinning_top_sim.tools import conventions, identify
 from spinning_top_sim.tools.identify import NEAR, NO_FAULT, SURE, Cause, Fit, Model
@@ -30,9 +29,7 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
-# Share by which a size may differ from that of a unit, and entries from those of axes: units are
-# further apart; and of a matrix that is no turn.
-LIKE, OF_TURN = 0.1, 0.3
+OF_TURN = 0.3               # share of a change by which a matrix may be no turn
 # Share by which gravity differs on Earth, and that of it which a small world still has.
 GRAVITY_BAND, ELSEWHERE = 6e-3, 0.05
 EARTH_FIELD = 15e-6, 90e-6  # [T]
@@ -49,13 +46,12 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
         return Report(kind, unjudged=[f'{kind}: too few samples'] * (
             any(kind in one.readings for one in stretches)))
     shift = compared.lag()
-    model = compared.model(shift)
-    if kind == 'accelerations':
-        right, local = model.fit([]), model.fit(['gravity'])
-        if abs(local.found[-1]) < GRAVITY_BAND and local.beyond < UNEXPLAINED * right.beyond:
-            compared.gravity *= 1.0 + float(local.found[-1])    # of another place on Earth
-            model = compared.model(shift)
-    found, rest = Causes(compared, model).find()
+    model, found, rest = _explained(compared, shift)
+    other = compared.exchanged(shift) if found else compared
+    if not np.array_equal(other.exchange, AXES):
+        another, others, left = _explained(other, shift)
+        if cost(others := [_exchange(other), *others]) < cost(found):
+            compared, model, found, rest = other, another, others, left
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
     late, sigma, unjudged = math.nan, math.inf, [*_untold(compared, model)]
@@ -85,6 +81,35 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
                   marks, unjudged=unjudged)
 
 
+def cost(found: Sequence[Finding]) -> int:
+    """Return how unlikely faults are: the more, the less explained, the more free numbers."""
+    return sum({'inaccurate': 9, 'bias': 2, 'gravity': 2, 'mounting': 2, 'reading_scale': 2}.get(
+        one.name, 1) for one in found)
+
+
+def _exchange(compared: Comparison) -> Finding:
+    """Return the fault whose undoing is `compared.exchange`."""
+    size = 1.0 / float(np.linalg.norm(compared.exchange[0]))
+    axes = size * compared.exchange.T
+    unit = next((f', in {name}' for name, one in compared.units.items() if one * size == 1.0), '')
+    name = next(name for name, one in (('units', axes), ('reading_sign', -axes),
+                                       ('sign', np.abs(axes)), ('axes', AXES))
+                if np.array_equal(one, AXES))
+    return Finding(name, f'the readings are {size:.4g} times the right ones, axes '
+                   f'{conventions.axes(axes)}{unit}', size)
+
+
+def _explained(compared: Comparison, lag: int) -> tuple[Model, list[Finding], Fit]:
+    """Return the model of readings that are late, the faults that explain them, what is left."""
+    model = compared.model(lag)
+    if compared.kind == 'accelerations':
+        right, local = model.fit([]), model.fit(['gravity'])
+        if abs(local.found[-1]) < GRAVITY_BAND and local.beyond < UNEXPLAINED * right.beyond:
+            compared.gravity *= 1.0 + float(local.found[-1])    # of another place on Earth
+            model = compared.model(lag)
+    return model, *Causes(compared, model).find()
+
+
 def _interval(sigma: float, unit: str = '') -> str:
     return f'+- {1.96 * sigma:.2g} {unit}'.rstrip()
 
@@ -99,8 +124,7 @@ class Causes:
 
     def __init__(self, compared: Comparison, model: Model) -> None:
         self.compared, self.model = compared, model
-        self.kind, self.noisy = compared.kind, compared.noisy
-        self.arms = [name for name in compared.always if name.startswith('arm')]
+        self.kind, self.noisy, self.arms = compared.kind, compared.noisy, compared.arms
         self.strange = max(STRANGE, REAL * self.noisy, OF_STEPS * compared.stepped)
 
     def find(self) -> tuple[list[Finding], Fit]:
@@ -142,7 +166,7 @@ class Causes:
             yield Cause(['difference'], _difference)
             yield Cause(['gravity', 'fixed gravity'], identify.instead(
                 'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
-            arm, judged = ('turned arm', _split_arm) if self.arms else ('arm', self._arm)
+            arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
             yield Cause([f'{arm} {k}' for k in range(3)], judged)
         yield Cause(OFFSETS, self._bias)
         for effect, name, text in (
@@ -151,10 +175,9 @@ class Causes:
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
             yield Cause([*(f'in world {arm}' for arm in self.arms), 'total', effect],
                         identify.instead(name, f'the readings are in axes of {text}'))
-        if self.arms or not self.compared.always:       # of an unknown field it is no product
-            yield Cause([f'matrix {i}{j} {of}' for of in (*self.arms, 'total')
-                         for i, j in ENTRIES],
-                        lambda found: self._matrix(AXES + found[-9:].reshape(3, 3)))
+        if self.arms or not self.compared.always:   # of an unknown field it is no product
+            yield Cause(self.compared.matrix, lambda found: self._matrix(
+                AXES + found[-9:].reshape(3, 3)))
 
     def _clear(self, name: str) -> bool:
         """Return whether an effect is much larger than its noise."""
@@ -164,8 +187,7 @@ class Causes:
         """Judge the size of a term."""
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:z.4f} times its size'
-        # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
+        if not self._clear(term):       # a term of noise seems to be missing
             return None
         for unit, size in columns.LENGTHS.items() if term == 'linear' else ():
             if abs(share - size) + self.model.fit([term]).sigma[-1] < LIKE * size:
@@ -189,6 +211,16 @@ class Causes:
         return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
                        f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
 
+    def _split_arm(self, found: Reals) -> Finding | None:
+        """Judge by the arms that a x r and w x (w x r) have, where none is given."""
+        seen = [self.model.size(name) for name in self.arms]
+        sizes = {'tangential': float(np.linalg.norm(seen * (found[:3] + found[-3:]))),
+                 'centripetal': float(np.linalg.norm(seen * found[:3]))}
+        term = min(sizes, key=lambda one: sizes[one])
+        share = sizes[term] / max(sizes.values())
+        return Finding(TERMS[term], f'the term {term} has {share:.4f} times its size',
+                       share) if share < NEAR else None
+
     def _bias(self, found: Reals) -> Finding | None:
         offset = found[-3:]
         if self.kind == 'magnetometer' and self.compared.always and (
@@ -203,46 +235,29 @@ class Causes:
 
     def _matrix(self, matrix: Reals) -> Finding | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
-        size = abs(float(np.linalg.det(matrix))) ** (1.0 / 3.0)
-        unit, factor = next(((f', in {name}', one) for name, one in self.compared.units.items()
-                             if one != 1.0 and abs(size * one - 1.0) < LIKE), ('', 1.0))
-        shape, change = matrix * factor, float(np.max(np.abs(matrix - AXES)))
-        axes = np.rint(shape)
-        if np.array_equal(axes @ axes.T, AXES) and np.max(np.abs(shape - axes)) < LIKE and (
-                unit or not np.array_equal(axes, AXES)):
-            return Finding('units' if np.array_equal(axes, AXES) else
-                           'reading_sign' if np.array_equal(axes, -AXES) else
-                           'sign' if np.array_equal(np.abs(axes), AXES) else 'axes',
-                           f'the readings are {size:.4g} times the right ones, axes '
-                           f'{conventions.axes(axes)}{unit}', size)
+        change = float(np.max(np.abs(matrix - AXES)))
+        if np.max(np.abs(matrix)) < STRANGE:    # they are something else
+            return None
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             name, small = ('rates_scale', STRANGE) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
             return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
                            'what they should be', matrix[0, 0])
-        left, _, right = np.linalg.svd(shape)
+        left, _, right = np.linalg.svd(matrix)
         turn = left @ right
-        if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
-                REAL, OF_TURN * change):
-            vector = Rotation.from_matrix(turn).inv().as_rotvec()
-            angle = float(np.linalg.norm(vector))
-            return Finding('mounting' * (angle > self.strange), 'the axes of the readings are '
-                           f'turned by ({listed(vector)}) rad{unit}', angle)
-        return None
+        if np.linalg.det(turn) < 0.0:
+            return None
+        vector = Rotation.from_matrix(turn).inv().as_rotvec()
+        angle = float(np.linalg.norm(vector))
+        near = np.max(np.abs(matrix - turn)) < max(REAL, OF_TURN * change)
+        return Finding('mounting', 'the axes of the readings are turned by '
+                       f'({listed(vector)}) rad', angle) if near and angle > self.strange else None
 
 
 def _difference(found: Reals) -> Finding | None:
     delay = -float(found[-1])
     return Finding('finite_differences', 'the acceleration, without gravity, is a difference of '
                    f'velocities {delay:.3g} steps ago', delay) if 0.25 < delay < 0.8 else None
-
-
-def _split_arm(found: Reals) -> Finding | None:
-    """Judge by the arms that a x r and w x (w x r) have, where none is given."""
-    sizes = np.linalg.norm(found[:3] + found[-3:]), np.linalg.norm(found[:3])
-    shares = (sizes / np.max(sizes)).tolist()
-    return next((Finding(TERMS[term], f'the term {term} has {share:z.4f} times its size', share)
-                 for term, share in zip(TERMS, shares, strict=False) if share < NEAR), None)
 
 
 def _estimates(kind: str, model: Model, unit: str) -> Iterator[tuple[str, Mark]]:

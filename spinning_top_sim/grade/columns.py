@@ -3,13 +3,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics.top import numbers
-from spinning_top_sim.tools import kinematics
+from spinning_top_sim.tools import conventions, kinematics
 from spinning_top_sim.tools.identify import SURE, TARGET, Model, rms
 from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
 
@@ -19,6 +20,9 @@ STANDARD_GRAVITY = 9.80665
 NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR, NOISY = 0.03, 1e-3   # noise of rates or forces, relative: small enough; not negligible
 ARM = np.full(3, 0.06)  # of an IMU whose place is not known [m]
+# Signed permutations: those that exchange the fewest axes first.
+EXCHANGES = sorted((sign * axes for axes in np.rint(conventions.TURNS.as_matrix())
+                    for sign in (1.0, -1.0)), key=lambda one: -np.trace(np.abs(one)))
 LAGS = range(-5, 41)    # that are tried [samples]
 EXACT = 1e-5            # share of a reading that differences of poses may leave
 # Terms and effects that any reading may have, along any axes.
@@ -78,6 +82,10 @@ class Comparison:
         known = {'accelerations': imu.lever_arm, 'magnetometer': imu.field}.get(kind, ())
         self.always = [f'{"field" if kind == "magnetometer" else "arm"} {k}'
                        for k in range(3)] if known is None else []
+        self.arms = self.always if kind == 'accelerations' else []
+        # Effects of a matrix on all terms.
+        self.matrix = [f'matrix {i}{j} {of}' for of in (*self.arms, 'total') for i, j in ENTRIES]
+        self.exchange = AXES        # by which what is read is multiplied
         self.mounting = Rotation.from_quat((0, 0, 0, 1) if kind == 'rates' else imu.mounting)
         stretches = [one for one in stretches if kind in one.readings]
         sizes = [rms(one.readings[kind]) for one in stretches]
@@ -89,7 +97,7 @@ class Comparison:
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
         self.stepped = any(one.rates is None and not one.intervals for one in stretches)
         self.motions, self.noisy = self._clear(stretches, widths)
-        if self.always and self.motions and kind == 'accelerations':
+        if self.arms and self.motions:
             self.arm = self.model(0).fit([]).found
 
     def _clear(self, stretches: Sequence[Stretch], widths: Sequence[int],
@@ -113,9 +121,10 @@ class Comparison:
                 break
         return motions, least > NOISY
 
-    def read(self, motion: Smoothed, lag: int) -> Reals:
+    def read(self, motion: Smoothed, lag: int, matrix: Reals | None = None) -> Reals:
         """Return readings that are `lag` samples late, smoothed (m, 3); ends are wrapped."""
-        reading = self.mounting.apply(np.roll(motion.body.readings[self.kind], -lag, axis=0))
+        reading = self.mounting.apply(np.roll(motion.body.readings[self.kind], -lag, axis=0)
+                                      @ (self.exchange if matrix is None else matrix).T)
         return (motion.rate if self.kind in OF_TURNS else motion.vector)(reading)
 
     def lag(self) -> int:
@@ -137,6 +146,27 @@ class Comparison:
         near = squares < squares[best] + unlike * max(squares[best], least)
         alone = np.max(np.abs(np.flatnonzero(near) - best)) <= 1 and 0 < best < len(lags) - 1
         return lags[best] if alone and squares[lags.index(0)] > least else 0
+
+    def exchanged(self, lag: int) -> 'Comparison':
+        """Return the same with those axes, signs, and unit of readings that fit best."""
+        keep, squares = slice(abs(lag), -abs(lag) or None), np.zeros((10, 10))
+        for (motion, _), size in zip(self.motions, self.sizes, strict=True):
+            effects = self.columns(motion)
+            rows = np.stack([effects['total'], *(self.read(motion, lag, np.outer(one, two))
+                                                 for one in AXES for two in AXES),
+                             *(effects[name] for name in self.always)])[:, keep]
+            rows = rows.reshape(len(rows), -1).T / size
+            left = rows[:, :10] - rows[:, 10:] @ np.linalg.lstsq(rows[:, 10:], rows[:, :10])[0]
+            squares += left.T @ left
+        tried = [(unit, axes) for unit in self.units.values() for axes in EXCHANGES]
+        sizes = np.array([np.append(-1.0 / unit, axes) for unit, axes in tried])
+        rest = np.sqrt(np.maximum(np.sum(sizes @ squares * sizes, axis=1), 0.0))
+        good = rest <= conventions.AS_GOOD * np.min(rest) + EXACT * math.sqrt(squares[0, 0])
+        unit, axes = tried[int(np.argmax(good))]
+        other = copy(self)
+        other.exchange, other.sizes = unit * axes, unit * self.sizes
+        other.reading_noise *= unit
+        return other
 
     def model(self, lag: int) -> Model:
         """Return what readings that are `lag` samples late may contain beside what is right."""
@@ -162,16 +192,15 @@ class Comparison:
         else:
             effects = dict.fromkeys(('rates', 'total', 'whole'), motion.rates)
         total = effects['total']
-        arms = self.always if self.kind == 'accelerations' else []
 
         def turned(reading: Reals) -> Reals:
             return self.mounting.apply(along(motion.turn, reading))
 
         effects |= {
             'world': turned(total), 'reversed': turned(turned(total)),
-            **{f'in world {arm}': turned(effects[arm]) for arm in arms},
+            **{f'in world {arm}': turned(effects[arm]) for arm in self.arms},
             **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
-        for of in ('total', *arms):
+        for of in ('total', *self.arms):
             effects |= {f'matrix {i}{j} {of}': np.outer(effects[of][:, j], AXES[i])
                         for i, j in ENTRIES}
         return effects
