@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.grade import columns
 from spinning_top_sim.grade.columns import AXES, DENSITIES, ENTRIES, OF_TURNS, Comparison, Imu
 from spinning_top_sim.tools import conventions, identify
 from spinning_top_sim.tools.identify import NEAR, NO_FAULT, SURE, Cause, Fit, Model
@@ -28,6 +29,7 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 # and attitudes; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
+IN_G = 0.1                  # share by which the size of a term in g may be wrong
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 OF_TURN = 0.3               # share of a change by which a matrix may be no turn
 # Share by which gravity differs on Earth, and that of it which a small world still has.
@@ -47,10 +49,11 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
             any(kind in one.readings for one in stretches)))
     shift = compared.lag()
     model, found, rest = _explained(compared, shift)
-    other = compared.exchanged(shift) if found else compared
+    other = compared.exchanged(shift) if found or rest.beyond > STRANGE else compared
     if not np.array_equal(other.exchange, AXES):
         another, others, left = _explained(other, shift)
-        if cost(others := [_exchange(other), *others]) < cost(found):
+        others = [_exchange(other), *others]
+        if cost(others) < cost(found) or left.beyond + STRANGE < UNEXPLAINED * rest.beyond:
             compared, model, found, rest = other, another, others, left
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
@@ -187,7 +190,8 @@ class Causes:
         """Judge the size of a term."""
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:z.4f} times its size'
-        if not self._clear(term):       # a term of noise seems to be missing
+        # A term of noise seems to be missing; gravity is in g where the whole reading is.
+        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < IN_G:
             return None
         for unit, size in columns.LENGTHS.items() if term == 'linear' else ():
             if abs(share - size) + self.model.fit([term]).sigma[-1] < LIKE * size:
