@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.causes import CLEARLY, DENSITIES, IN_G, OFFSETS, cost, judge
+from spinning_top_sim.grade.causes import CLEARLY, DENSITIES, LIKE, OFFSETS, cost, judge
 from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, UP, Comparison, Imu
 from spinning_top_sim.grade.files import PARTS, Recorded, known
 from spinning_top_sim.physics.top import numbers
@@ -19,7 +19,6 @@ from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stret
 from spinning_top_sim.tools.report import Finding, Report
 
 EXCERPT = 1000          # samples of a motion by which a convention is found, to be fast
-SMALL = 0.1             # share of a reading that another convention may leave
 SMALL = 0.1             # share of a reading that another convention may leave
 HELD_RUNS, HELD_SHARE = 20, 0.95    # of a hold: runs of equal rows, share of equal length
 JUMP = 10.0             # times a step of poses is longer than those beside and than usual
@@ -63,8 +62,9 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *,
             for name in READINGS if name in parts))
 
     report = judged(bodies)
-    convention = convention_of(bodies, imu, gravity) if report.found and (
-        'gravity_sign' not in report.faults) else Convention()
+    # A z that is down is left to the sign of gravity.
+    convention = Convention() if report.faults in ([], ['gravity_sign']) else (
+        convention_of(bodies, imu, gravity))
     if convention.parts:
         other = judged([undone(body, convention) for body in bodies])
         if cost(other.found) < cost(report.found):
@@ -145,7 +145,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
                 fit = model.fit(['total', *OFFSETS])
                 size = 1.0 + fit.found[len(compared.always)]
                 right = not model.clear('total', CLEARLY) or any(
-                    abs(size * unit - 1.0) < IN_G for unit in compared.units.values())
+                    abs(size * unit - 1.0) < LIKE for unit in compared.units.values())
                 worst = max(worst, fit.beyond * (fit.beyond > 2.0 * fit.noise) if right else 1.0)
         return worst
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import columns
 from spinning_top_sim.grade.columns import AXES, DENSITIES, ENTRIES, OF_TURNS, Comparison, Imu
-from spinning_top_sim.tools import conventions, identify
+from spinning_top_sim.tools import identify
 from spinning_top_sim.tools.identify import NEAR, NO_FAULT, SURE, Cause, Fit, Model
 from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark, Report
@@ -29,7 +29,7 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 # and attitudes; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED = 0.25          # share of a discrepancy, with noise of a reading, left at most
-IN_G = 0.1                  # share by which the size of a term in g may be wrong
+LIKE = 0.1                  # share by which a size may differ from that of a unit
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 OF_TURN = 0.3               # share of a change by which a matrix may be no turn
 # Share by which gravity differs on Earth, and that of it which a small world still has.
@@ -49,10 +49,9 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
             any(kind in one.readings for one in stretches)))
     shift = compared.lag()
     model, found, rest = _explained(compared, shift)
-    other = compared.exchanged(shift) if found or rest.beyond > STRANGE else compared
-    if not np.array_equal(other.exchange, AXES):
+    if found or rest.beyond > STRANGE:
+        other = compared.exchanged(shift)
         another, others, left = _explained(other, shift)
-        others = [_exchange(other), *others]
         if cost(others) < cost(found) or left.beyond + STRANGE < UNEXPLAINED * rest.beyond:
             compared, model, found, rest = other, another, others, left
     right, alone = model.fit([]), model.fit(['step'])
@@ -90,18 +89,6 @@ def cost(found: Sequence[Finding]) -> int:
         one.name, 1) for one in found)
 
 
-def _exchange(compared: Comparison) -> Finding:
-    """Return the fault whose undoing is `compared.exchange`."""
-    size = 1.0 / float(np.linalg.norm(compared.exchange[0]))
-    axes = size * compared.exchange.T
-    unit = next((f', in {name}' for name, one in compared.units.items() if one * size == 1.0), '')
-    name = next(name for name, one in (('units', axes), ('reading_sign', -axes),
-                                       ('sign', np.abs(axes)), ('axes', AXES))
-                if np.array_equal(one, AXES))
-    return Finding(name, f'the readings are {size:.4g} times the right ones, axes '
-                   f'{conventions.axes(axes)}{unit}', size)
-
-
 def _explained(compared: Comparison, lag: int) -> tuple[Model, list[Finding], Fit]:
     """Return the model of readings that are late, the faults that explain them, what is left."""
     model = compared.model(lag)
@@ -110,7 +97,8 @@ def _explained(compared: Comparison, lag: int) -> tuple[Model, list[Finding], Fi
         if abs(local.found[-1]) < GRAVITY_BAND and local.beyond < UNEXPLAINED * right.beyond:
             compared.gravity *= 1.0 + float(local.found[-1])    # of another place on Earth
             model = compared.model(lag)
-    return model, *Causes(compared, model).find()
+    found, rest = Causes(compared, model).find()
+    return model, [*compared.told, *found], rest
 
 
 def _interval(sigma: float, unit: str = '') -> str:
@@ -191,7 +179,7 @@ class Causes:
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:z.4f} times its size'
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < IN_G:
+        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
             return None
         for unit, size in columns.LENGTHS.items() if term == 'linear' else ():
             if abs(share - size) + self.model.fit([term]).sigma[-1] < LIKE * size:
@@ -247,15 +235,13 @@ class Causes:
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
             return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
                            'what they should be', matrix[0, 0])
-        left, _, right = np.linalg.svd(matrix)
-        turn = left @ right
-        if np.linalg.det(turn) < 0.0:
+        if np.linalg.det(matrix) <= 0.0:
             return None
-        vector = Rotation.from_matrix(turn).inv().as_rotvec()
-        angle = float(np.linalg.norm(vector))
-        near = np.max(np.abs(matrix - turn)) < max(REAL, OF_TURN * change)
+        turn = Rotation.from_matrix(matrix)
+        angle, near = float(turn.magnitude()), max(REAL, OF_TURN * change)
         return Finding('mounting', 'the axes of the readings are turned by '
-                       f'({listed(vector)}) rad', angle) if near and angle > self.strange else None
+                       f'({listed(turn.inv().as_rotvec())}) rad', angle) if (
+            angle > self.strange and np.max(np.abs(matrix - turn.as_matrix())) < near) else None
 
 
 def _difference(found: Reals) -> Finding | None:

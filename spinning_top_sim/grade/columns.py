@@ -13,6 +13,7 @@ from spinning_top_sim.physics.top import numbers
 from spinning_top_sim.tools import conventions, kinematics
 from spinning_top_sim.tools.identify import SURE, TARGET, Model, rms
 from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
+from spinning_top_sim.tools.report import Finding
 
 UP, AXES = np.array((0.0, 0.0, 1.0)), np.eye(3)
 ENTRIES = [(i, j) for i in range(3) for j in range(3)]
@@ -85,7 +86,8 @@ class Comparison:
         self.arms = self.always if kind == 'accelerations' else []
         # Effects of a matrix on all terms.
         self.matrix = [f'matrix {i}{j} {of}' for of in (*self.arms, 'total') for i, j in ENTRIES]
-        self.exchange = AXES        # by which what is read is multiplied
+        self.exchange = AXES        # by which what is read is multiplied, and the fault of that
+        self.told: list[Finding] = []
         self.mounting = Rotation.from_quat((0, 0, 0, 1) if kind == 'rates' else imu.mounting)
         stretches = [one for one in stretches if kind in one.readings]
         sizes = [rms(one.readings[kind]) for one in stretches]
@@ -166,6 +168,10 @@ class Comparison:
         other = copy(self)
         other.exchange, other.sizes = unit * axes, unit * self.sizes
         other.reading_noise *= unit
+        name = next((name for name, one in (('units', axes), ('reading_sign', -axes), (
+            'sign', np.abs(axes)), ('axes', AXES)) if np.array_equal(one, AXES)))
+        other.told = [Finding(name, f'the readings are {1.0 / unit:.4g} times the right ones, '
+                              f'axes {conventions.axes(axes.T)}')]
         return other
 
     def model(self, lag: int) -> Model:
