@@ -155,7 +155,7 @@ def test_lists_are_arrays_positions_in_mm_are_told_and_attitudes_are_asked_for()
     lists = {name: [one.tolist() for one in pair] for name, pair in PARTS.items()}
     assert str(grade_readings(lists)) == str(grade_readings(PARTS))
     mm = grade_readings({**PARTS, 'positions': (T, 1e3 * PARTS['positions'][1])})
-    assert mm.faults == ['units'] and 'as of positions in mm' in str(mm), mm
+    assert mm.faults == ['no_linear_acceleration'] and 'positions in mm' in str(mm), mm
     with pytest.raises(ValueError, match='no attitudes; the first time is 0 s; gyroscope of'):
         grade_readings({'gyroscope': (T, W)})
 

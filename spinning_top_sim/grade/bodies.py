@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Grades the IMU of any rigid body against its poses; no top is needed."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -135,21 +134,22 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     widths = {name: [compared.motions[0][0].width] for name in ('gyroscope', 'accelerations')
               if (compared := Comparison(name, [body], imu, gravity)).motions}
 
-    def left(convention: Convention, most: float = math.inf) -> float:
-        """Return the largest share of a reading that is left; more than `most` ends the search."""
+    def left(convention: Convention) -> float:
+        """Return the largest share of a reading that is left."""
         told, worst = undone(body, convention), 0.0
         for name, width in widths.items():
-            if worst <= most:
-                compared = Comparison(name, [told], imu, gravity, width)
-                model = compared.model(0)
-                fit = model.fit(['total', *OFFSETS])
-                size = 1.0 + fit.found[len(compared.always)]
-                right = not model.clear('total', CLEARLY) or any(
-                    abs(size * unit - 1.0) < LIKE for unit in compared.units.values())
-                worst = max(worst, fit.beyond * (fit.beyond > 2.0 * fit.noise) if right else 1.0)
+            compared = Comparison(name, [told], imu, gravity, width)
+            model = compared.model(0)
+            fit = model.fit(['total', *OFFSETS])
+            size = 1.0 + fit.found[len(compared.always)]
+            right = not model.clear('total', CLEARLY) or any(
+                abs(size * unit - 1.0) < LIKE for unit in compared.units.values())
+            worst = max(worst, fit.beyond * (fit.beyond > 2.0 * fit.noise) if right else 1.0)
+            if worst > SMALL:
+                break
         return worst
 
-    after = [left(one, SMALL) for one in others]
+    after = [left(one) for one in others]
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(np.array(after) <= conventions.AS_GOOD * min(after) + 1e-6))
     return others[best] if after[best] < SMALL else ours

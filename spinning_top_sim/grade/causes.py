@@ -123,14 +123,13 @@ class Causes:
         right = self.model.fit([])
         if self.kind == 'magnetometer' and self.compared.always:
             size, (low, high) = float(np.linalg.norm(right.found)), EARTH_FIELD
-            units = [name for name, factor in self.compared.units.items()
-                     if low < factor * size < high]
             # Magnets and iron make no field that is still so large, or so small.
-            odd = right.beyond <= STRANGE and not 0.1 * low < size < 10.0 * high
-            if 'T' not in units and (units or odd):
-                return [Finding('units' if units else 'reading_scale', f'the field is {size:.4g}, '
-                                f'of the Earth {low:g} to {high:g} T, as if in '
-                                f'{"".join(units[:1]) or "no unit"}', size)], right
+            if not 0.1 * low < size < 10.0 * high:
+                unit = next((name for name, factor in self.compared.units.items()
+                             if low < factor * size < high), '')
+                return [Finding('units' if unit else 'reading_scale', f'the field is {size:.4g}, '
+                                f'as if in {unit or "no unit"}, of the Earth {low:g} to {high:g}',
+                                size)], right
         if right.beyond <= STRANGE:     # of each sample: a mean is known better
             bias = self.model.fit(['step', *OFFSETS])
             size = float(np.linalg.norm(bias.found[-3:])) * self.model.size(OFFSETS[0])
@@ -155,17 +154,17 @@ class Causes:
             return
         if self.kind == 'accelerations':
             yield Cause(['difference'], _difference)
-            yield Cause(['gravity', 'fixed gravity'], identify.instead(
-                'gravity_frame', 'gravity is along z of the IMU and does not turn with it'))
             arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
             yield Cause([f'{arm} {k}' for k in range(3)], judged)
         yield Cause(OFFSETS, self._bias)
-        for effect, name, text in (
-                ('world', 'rates_in_world' if self.kind in OF_TURNS else 'reading_in_world',
-                 'the world, not of the IMU'),
-                ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
-            yield Cause([*(f'in world {arm}' for arm in self.arms), 'total', effect],
-                        identify.instead(name, f'the readings are in axes of {text}'))
+        arms = [f'in world {arm}' for arm in self.arms]
+        for effects, name, text in (
+                (['gravity', 'fixed gravity'], 'gravity_frame', 'gravity is along z of the IMU'),
+                ([*arms, 'total', 'world'], 'rates_in_world' if self.kind in OF_TURNS else
+                 'reading_in_world', 'the readings are in axes of the world'),
+                ([*arms, 'total', 'reversed'], 'rotation_reversed', 'the IMU turns backwards')):
+            if effects[-1] in self.model.names:
+                yield Cause(effects, identify.instead(name, text))
         if self.arms or not self.compared.always:   # of an unknown field it is no product
             yield Cause(self.compared.matrix, lambda found: self._matrix(
                 AXES + found[-9:].reshape(3, 3)))
@@ -181,11 +180,9 @@ class Causes:
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
         if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
             return None
-        for unit, size in columns.LENGTHS.items() if term == 'linear' else ():
-            if abs(share - size) + self.model.fit([term]).sigma[-1] < LIKE * size:
-                return Finding('units', f'{text}, as of positions in {unit}', share)
         if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
-            return Finding(TERMS[term], text, share)
+            millimetres = term == 'linear' and abs(1e3 * share - 1.0) < LIKE
+            return Finding(TERMS[term], text + ', as of positions in mm' * millimetres, share)
         if share < 0.0:
             return Finding('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
         if term == 'gravity':

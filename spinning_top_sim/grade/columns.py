@@ -28,8 +28,7 @@ LAGS = range(-5, 41)    # that are tried [samples]
 EXACT = 1e-5            # share of a reading that differences of poses may leave
 # Terms and effects that any reading may have, along any axes.
 ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field', 'rates'
-# Units with their sizes: of positions, but for m; of readings, SI first.
-LENGTHS = {'cm': 1e-2, 'mm': 1e-3}
+# Units of readings with their sizes, SI first.
 READINGS: dict[str, Mapping[str, float]] = {
     'gyroscope': {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0,
                   'dps': math.pi / 180.0, 'rpm': math.pi / 30.0},
@@ -160,18 +159,18 @@ class Comparison:
             rows = rows.reshape(len(rows), -1).T / size
             left = rows[:, :10] - rows[:, 10:] @ np.linalg.lstsq(rows[:, 10:], rows[:, :10])[0]
             squares += left.T @ left
-        tried = [(unit, axes) for unit in self.units.values() for axes in EXCHANGES]
-        sizes = np.array([np.append(-1.0 / unit, axes) for unit, axes in tried])
+        tried = [(*unit, axes) for unit in self.units.items() for axes in EXCHANGES]
+        sizes = np.array([np.append(-1.0 / unit, axes) for _, unit, axes in tried])
         rest = np.sqrt(np.maximum(np.sum(sizes @ squares * sizes, axis=1), 0.0))
         good = rest <= conventions.AS_GOOD * np.min(rest) + EXACT * math.sqrt(squares[0, 0])
-        unit, axes = tried[int(np.argmax(good))]
+        called, unit, axes = tried[int(np.argmax(good))]
         other = copy(self)
         other.exchange, other.sizes = unit * axes, unit * self.sizes
         other.reading_noise *= unit
         name = next((name for name, one in (('units', axes), ('reading_sign', -axes), (
             'sign', np.abs(axes)), ('axes', AXES)) if np.array_equal(one, AXES)))
         other.told = [Finding(name, f'the readings are {1.0 / unit:.4g} times the right ones, '
-                              f'axes {conventions.axes(axes.T)}')]
+                              f'axes {conventions.axes(axes.T)}, in {called}', 1.0 / unit)]
         return other
 
     def model(self, lag: int) -> Model:

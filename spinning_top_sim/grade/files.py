@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from spinning_top_sim.grade.columns import LENGTHS, NORM, READINGS
+from spinning_top_sim.grade.columns import NORM, READINGS
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.table import Columns, read_columns
 from spinning_top_sim.times import NEVER_NS, stamp_text
@@ -33,7 +33,7 @@ from spinning_top_sim.tools.scene_file import likely_name
 PARTS: dict[str, tuple[Sequence[str], Mapping[str, Any]]] = {
     't': (['t'], {'s': 10 ** 9, 'ms': 10 ** 6, 'us': 10 ** 3, 'ns': 1}),
     'attitudes': (['qx', 'qy', 'qz', 'qw'], {'1': 1.0}),
-    'positions': (['px', 'py', 'pz'], {'m': 1.0, **LENGTHS}),
+    'positions': (['px', 'py', 'pz'], {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}),
     **{name: ([f'{letter}{axis}' for axis in 'xyz'], READINGS[name])
        for name, letter in zip(READINGS, 'gam', strict=True)}}
 UNITS = {name: units for names, units in PARTS.values() for name in names}
