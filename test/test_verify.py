@@ -148,7 +148,10 @@ def test_what_a_sensor_delays_or_drops_is_not_missing_and_a_message_that_is_lost
     {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
     {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
-def test_odd_metadata_and_odd_entries_of_the_journal_end_in_words(short, tmp_path, capsys, odd):
+def test_odd_metadata_and_odd_entries_of_the_journal_end_in_words(
+        short, tmp_path, capsys, monkeypatch, odd):
+    monkeypatch.setattr(recorded_run, 'WORK_A_BYTE', 0)     # else 10^18 ns take half a minute
+    monkeypatch.setattr(recorded_run, 'LEAST_WORK', 20_000)
     data = messages.string(json.dumps({'t_ns': 0, 'sent_ns': 300_000_000, **odd}))
     path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
         [old, data] if 'event' in odd and topic.endswith('/events') and number == 1 else old),
