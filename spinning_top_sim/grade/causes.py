@@ -153,7 +153,10 @@ class Causes:
         if self.kind == 'rates' and before <= self.strange:      # their size is known as well
             return
         if self.kind == 'accelerations':
-            yield Cause(['difference'], _difference)
+            yield Cause(['difference'], lambda found: Finding(
+                'finite_differences', 'the acceleration, without gravity, is a difference of '
+                f'velocities {-found[-1]:.3g} steps ago', -found[-1]) if (
+                    0.25 < -found[-1] < 0.8) else None)
             arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
             yield Cause([f'{arm} {k}' for k in range(3)], judged)
         yield Cause(OFFSETS, self._bias)
@@ -239,12 +242,6 @@ class Causes:
         return Finding('mounting', 'the axes of the readings are turned by '
                        f'({listed(turn.inv().as_rotvec())}) rad', angle) if (
             angle > self.strange and np.max(np.abs(matrix - turn.as_matrix())) < near) else None
-
-
-def _difference(found: Reals) -> Finding | None:
-    delay = -float(found[-1])
-    return Finding('finite_differences', 'the acceleration, without gravity, is a difference of '
-                   f'velocities {delay:.3g} steps ago', delay) if 0.25 < delay < 0.8 else None
 
 
 def _estimates(kind: str, model: Model, unit: str) -> Iterator[tuple[str, Mark]]:

@@ -167,8 +167,8 @@ class Comparison:
         other = copy(self)
         other.exchange, other.sizes = unit * axes, unit * self.sizes
         other.reading_noise *= unit
-        name = next((name for name, one in (('units', axes), ('reading_sign', -axes), (
-            'sign', np.abs(axes)), ('axes', AXES)) if np.array_equal(one, AXES)))
+        name = 'axes' if np.trace(np.abs(axes)) < 3.0 else (
+            {3.0: 'units', -3.0: 'reading_sign'}.get(float(np.trace(axes)), 'sign'))
         other.told = [Finding(name, f'the readings are {1.0 / unit:.4g} times the right ones, '
                               f'axes {conventions.axes(axes.T)}, in {called}', 1.0 / unit)]
         return other
