@@ -65,10 +65,9 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *,
     convention = Convention() if report.faults in ([], ['gravity_sign']) else (
         convention_of(bodies, imu, gravity))
     if convention.parts:
-        other = judged([undone(body, convention) for body in bodies])
-        if cost(other.found) < cost(report.found):
-            return other.plus(Report('', [Finding(
-                'convention', f'attitudes are told as {convention.name}; this is undone')]))
+        told = Finding('convention', f'attitudes are told as {convention.name}; this is undone')
+        other = judged([undone(body, convention) for body in bodies]).plus(Report('', [told]))
+        return other if cost(other.found) <= cost(report.found) else report
     return report
 
 
