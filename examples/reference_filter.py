@@ -188,9 +188,9 @@ class ReferenceFilter:
 
 def product(p: Reals, q: Reals) -> Reals:
     """Return the normalised quaternion product p q, as x, y, z, w."""
-    r = np.array(attitude.product(p.tolist(), q.tolist()))
-    unit: Reals = r / math.sqrt(r @ r)
-    return unit
+    x, y, z, w = attitude.product(p.tolist(), q.tolist())
+    norm = math.hypot(x, y, z, w)
+    return np.array((x / norm, y / norm, z / norm, w / norm))
 
 
 def exponential(vector: Reals) -> Reals:

@@ -15,6 +15,7 @@ from helpers.faulty_simulators import cross
 from helpers.reference import ROOT
 from spinning_top_sim.exam.adapters import Vqf
 from spinning_top_sim.exam.measures import from_two_vectors
+from spinning_top_sim.physics import attitude
 
 reference = SimpleNamespace(**runpy.run_path(str(ROOT / 'examples/reference_filter.py')))
 ReferenceFilter, product = reference.ReferenceFilter, reference.product
@@ -68,7 +69,7 @@ class Mahony:
     """A filter of Mahony (2008): gains of tilt, heading [1/s] and bias [1/s^2]."""
 
     def __init__(self, up=0.3, north=0.3, learns=0.02, advance=body, triad=True, first=False,
-                 number=np.float64, level=True, most=np.inf, feels=(1.0, 1.0, 1.0), six=False,
+                 number=None, level=True, most=None, feels=(1.0, 1.0, 1.0), six=False,
                  in_world=False):
         self._gains, self._advance, self._triad, self._first = (
             (up, north, learns), advance, triad, first)
@@ -77,15 +78,20 @@ class Mahony:
 
     def _turn(self, a, m, dt):
         up, north, learns = self._gains
-        r = reference.matrix_of(self._q)
-        e = up / math.hypot(*a) * cross(a.tolist(), r[2].tolist()) * self._feels
+        # Numbers, which are faster than arrays of three.
+        q, a, turn = self._q.tolist(), a.tolist(), 0.0
+        vertical, weight = attitude.vertical_in_body(q), up / math.hypot(*a)
         if m is not None:
-            h = r @ m
             if not self._level:
-                yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
-                h = Rotation.from_euler('z', yaw).apply(m)
-            e = e + north * math.atan2(h[0], h[1]) * r[2]
-        self.bias = (self.bias - learns * dt * e).clip(-self._most, self._most)
+                yaw = Rotation.from_quat(q).as_euler('ZYX')[0]
+                q = Rotation.from_euler('z', yaw).as_quat().tolist()
+            east, ahead, _ = attitude.rotated(q, m.tolist())
+            turn = north * math.atan2(east, ahead)
+        e = np.array([weight * tilt * feels + turn * v for tilt, feels, v in zip(
+            cross(a, vertical), self._feels, vertical, strict=True)])
+        self.bias = self.bias - learns * dt * e
+        if self._most:
+            self.bias = self.bias.clip(-self._most, self._most)
         return e * dt
 
     def update(self, w, a, m, dt):
@@ -97,8 +103,9 @@ class Mahony:
         else:
             self._q = self._advance(self._q, (w - self.bias) * dt)
             self._q = body(self._q, self._turn(a, m, dt))
-        self._q = self._q.astype(self._number).astype(float)
-        self._q /= math.sqrt(self._q @ self._q)
+        if self._number:
+            self._q = self._q.astype(self._number).astype(float)
+            self._q /= math.sqrt(self._q @ self._q)
         if self._in_world and before is not None:       # the integral is in axes of the world
             self.bias = reference.matrix_of(self._q).T @ reference.matrix_of(before) @ self.bias
         return self._q.copy()
@@ -117,7 +124,7 @@ RIGHT = {
     'mahony, slow from the identity': partial(Mahony, 0.1, 0.1, 0.01, triad=False),
     'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True),
     'mahony, means of two': partial(Part, partial(Mahony, 1.0, 1.0, 0.1), late=(0, 1, 1, 0),
-                                    taken=lambda values: sum(values) / len(values)),
+                                    taken=lambda values: 0.5 * (values[0] + values[-1])),
     'mahony, field a step late': partial(Part, partial(Mahony, 3.0, 3.0, 0.5),
                                          late=(0, 0, 1, 0))}
 # Each with the faults that may be named.
