@@ -9,12 +9,13 @@ left-handed program changes world and sensor at once.
 
 import itertools
 import math
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.physics.attitude import product
 from spinning_top_sim.tools.identify import AXES, Reals, rms
 
 # Directions of the axes x, y, z of worlds that programs use, in ours.
@@ -26,10 +27,10 @@ TURNS = Rotation.create_group('O')          # the 24 right-handed signed permuta
 # A simpler convention is preferred to one that leaves up to this factor, or angle [rad], less.
 AS_GOOD, SAME = 1.5, math.radians(0.1)
 MOST = 3                # parts of a convention
+IDENTITY, INVERSE = np.array(((0.0, 0.0, 0.0, 1.0), (-1.0, -1.0, -1.0, 1.0)))   # by factors
 
 
-@dataclass(frozen=True)
-class Convention:
+class Convention(NamedTuple):
     """
     How attitudes are told; the default is ours.
 
@@ -41,8 +42,8 @@ class Convention:
 
     w_first: bool = False
     conjugate: bool = False
-    world: Reals = field(default_factory=lambda: np.array((0.0, 0.0, 0.0, 1.0)))
-    sensor: Reals = field(default_factory=lambda: np.array((0.0, 0.0, 0.0, 1.0)))
+    world: Reals = IDENTITY
+    sensor: Reals = IDENTITY
     parts: tuple[str, ...] = ()
 
     @property
@@ -52,12 +53,11 @@ class Convention:
 
     def undo(self, told: Reals) -> Reals:
         """Return attitudes (n, 4) in our convention from those that are told."""
-        q = Rotation.from_quat(told[:, [1, 2, 3, 0]] if self.w_first else told)
+        q: Any = told[:, [1, 2, 3, 0]] if self.w_first else told
         if self.conjugate:
-            q = q.inv()
-        ours: Reals = (Rotation.from_quat(self.world).inv() * q
-                       * Rotation.from_quat(self.sensor).inv()).as_quat()
-        return ours
+            q = q * INVERSE
+        ours = np.array(product(product(self.world * INVERSE, q.T), self.sensor * INVERSE))
+        return (ours / np.sqrt(np.sum(ours * ours, axis=0))).T
 
 
 class Found(NamedTuple):
@@ -68,6 +68,7 @@ class Found(NamedTuple):
     after: float
 
 
+@cache
 def group() -> list[Convention]:
     """Return the conventions with at most MOST parts, those with the fewest first."""
     lefts = [((), Rotation.identity()), *(((f'world {name}',), Rotation.from_matrix(
@@ -106,7 +107,6 @@ def best(told: Reals, truth: Reals, steady: bool = False) -> Found:
     found = [Found(one, 0.0, rms((errors.about_mean() if steady else errors).whole))
              for one, errors in every]
     least = min(one.after for one in found)
-    # The first has the fewest parts.
     return next(one for one in found if one.after <= max(AS_GOOD * least, SAME))._replace(
         before=found[0].after)
 
@@ -134,6 +134,6 @@ def errors_of(estimates: Reals, truth: Reals) -> Errors:
 
     estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
     """
-    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
-        canonical=True).T
-    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))
+    x, y, z, w = product(cast(Any, estimates.T), (truth * INVERSE).T)
+    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)),
+                  2.0 * np.arctan2(np.copysign(z, z * w), np.abs(w)))
