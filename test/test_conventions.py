@@ -22,7 +22,7 @@ FLIPPED = Rotation.from_euler('x', 180.0, degrees=True)
     ('w, x, y, z', TRUTH.as_quat()[:, [3, 0, 1, 2]]),
     ('world north-east-down', (NED * TRUTH).as_quat()),
     ('world north-west-up', (NWU * TRUTH).as_quat()),
-    ('sensor axes x, -y, -z', (TRUTH * FLIPPED).as_quat()),
+    ('sensor axes z, x, y', -(TRUTH * Rotation.from_quat([0.5] * 4)).as_quat()),
     ('w, x, y, z, world north-east-down, sensor axes x, -y, -z',
      (NED * TRUTH * FLIPPED).as_quat()[:, [3, 0, 1, 2]]),
     ('vector part x, -y, z', TRUTH.as_quat() * (1.0, -1.0, 1.0, 1.0))])

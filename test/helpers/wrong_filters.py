@@ -78,7 +78,6 @@ class Mahony:
 
     def _turn(self, a, m, dt):
         up, north, learns = self._gains
-        # Numbers, which are faster than arrays of three.
         q, a, turn = self._q.tolist(), a.tolist(), 0.0
         vertical, weight = attitude.vertical_in_body(q), up / math.hypot(*a)
         if m is not None:
