@@ -52,7 +52,10 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     if found or rest.beyond > STRANGE:
         other = compared.exchanged(shift)
         another, others, left = _explained(other, shift)
-        if cost(others) < cost(found) or left.beyond + STRANGE < UNEXPLAINED * rest.beyond:
+        # Noise may be exchanged for more noise.
+        known = not compared.noisy or SURE * another.fit(['total']).sigma[-1] < TELLS
+        if known and (cost(others) < cost(found)
+                      or left.beyond + STRANGE < UNEXPLAINED * rest.beyond):
             compared, model, found, rest = other, another, others, left
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too

@@ -21,9 +21,10 @@ STANDARD_GRAVITY = 9.80665
 NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR, NOISY = 0.03, 1e-3   # noise of rates or forces, relative: small enough; not negligible
 ARM = np.full(3, 0.06)  # of an IMU whose place is not known [m]
-# Signed permutations: those that exchange the fewest axes first.
+# Signed permutations, the simplest first.
 EXCHANGES = sorted((sign * axes for axes in np.rint(conventions.TURNS.as_matrix())
-                    for sign in (1.0, -1.0)), key=lambda one: -np.trace(np.abs(one)))
+                    for sign in (1.0, -1.0)), key=lambda one: (
+                        -np.trace(np.abs(one)), -abs(np.trace(one)), -np.trace(one)))
 LAGS = range(-5, 41)    # that are tried [samples]
 EXACT = 1e-5            # share of a reading that differences of poses may leave
 # Terms and effects that any reading may have, along any axes.
