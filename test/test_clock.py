@@ -58,6 +58,7 @@ def test_what_a_slow_clock_makes_due_is_on_time_for_half_a_second():
     top = Top(publishers=1).begin(100 * S + 4 * MS)
     assert top.epoch_ns == 100 * S
     assert top.tick(0, 100 * S + 4 * MS) == (4 * MS, -1), 't = 0 is on time'
+    assert top.begin(100 * S + 6 * MS).epoch_ns == 100 * S + 10 * MS, 'stamps do not go back'
     top.begin(200 * S)
     for steady_ns, second, late_ns in (
             (0, 201, -1), (400, 202, -1), (499, 202, -1), (500, 202, 1 * S), (900, 202, 2 * S)):
@@ -85,3 +86,5 @@ def test_of_two_clocks_the_latest_counts_and_stamps_are_never_ahead_of_it(lag_ns
     top.publishers = 1
     top.tick(5 * S, newest - lag_ns)
     assert 'stepped back' in top.warnings[-1]
+    top.tick(6 * S, newest + 2000 * S)
+    assert -EPOCH_GRID_NS < top.stamp_ns - (newest + 2000 * S) <= 0, 'at the clock again'

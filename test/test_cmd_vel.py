@@ -59,6 +59,13 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     assert goes_to(simulation, 11 * S + S // 2)[1][1] == 0.8
 
 
+def test_a_command_that_ends_within_its_ramp_leaves_the_pivot_at_rest():
+    simulation = simulate({'pivot.cmd_timeout': 0.1})
+    drive(simulation, 0.0, 0.8, 0.0)                # a ramp of 0.4 s, of which 0.1 s up and down
+    position, velocity = goes_to(simulation, S)
+    assert position == pytest.approx((0.0, 0.02, 0.0), abs=1e-12) and not velocity.any()
+
+
 def momenta(states):
     """Return L3 and Lz about the vertical of the world, by attitude and angular velocity."""
     top, (w1, w2, w3) = states.top, states.angular_velocity[0]

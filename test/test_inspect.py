@@ -74,6 +74,16 @@ def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, capsys, topic):
     assert all(drift < 1e-14 for drift in motion['drifts'].values())
 
 
+def test_a_nutation_faster_than_the_samples_is_not_measured_as_a_slow_one(tmp_path, capsys):
+    rate = 1.65
+    _, content = as_json(capsys, log_of(
+        tmp_path / 'run.mcap', '--duration', 100, '-p', f'joint_states.rate:={rate}', '-p',
+        'record.streams:=[joint_states]', '-p', 'solver.method:=exact'))
+    motion, = content['motions']
+    assert 1.0 < motion['exact']['nutation_period'] * rate < 1.1 and not motion['measured'][
+        'nutation_period'] and 'fewer than 9 samples' in motion['measured']['missing']
+
+
 def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
     """An angle and a rate that are off are told as such; one that is no number is left out."""
     def change(topic, number, data):

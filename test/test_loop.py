@@ -115,6 +115,11 @@ def test_a_pause_holds_a_step_is_exact_and_nothing_is_caught_up(monkeypatch):
     assert run.loop.late_ticks == run.loop.skipped_ticks == 0
 
 
+def test_the_last_sample_is_that_of_the_duration_to_the_nanosecond():
+    run = Run(duration=1.001, pose__rate=1000.0).ticks(202)      # 1.001e9 is no double
+    assert run.times == grid(1_001_000_000, SECOND // 1000) and run.loop.state is LoopState.ENDED
+
+
 def test_a_change_of_parameters_does_not_hide_a_jump_of_the_clock():
     run = Run(follows=True).ticks(4)
     run.now_ns += 3600 * SECOND

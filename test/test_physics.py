@@ -128,6 +128,13 @@ def test_a_motion_at_or_through_a_pole_has_its_name(theta, theta_dot, l3, lz, na
     assert described.name == name and described.gyroscopic_ratio == 0.25 * l3 * l3
 
 
+@pytest.mark.parametrize(('theta', 'name'), [(0.0, 'hanging'), (math.pi, 'sleeping')])
+def test_a_centre_of_mass_below_the_pivot_hangs_where_the_axis_is_up(theta, name):
+    top = Top(**{**TOP, 'com_distance': -0.15})
+    state = State(theta=theta, l3=3.0, lz=3.0 * math.cos(theta))
+    assert ExactSolution(top, state).describe().name == name
+
+
 @pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz', 'name'), [
     (0.6, 0.0, 1.6, 1.0, 'loops'), (1.2, 0.5, 0.3, 0.5, 'waves'), (1.2, 0.5, -0.3, 0.5, 'waves'),
     (1.0, 2.0, -0.3, -0.6, 'waves'), (2.0, 1.0, 0.3, -0.5, 'waves'),

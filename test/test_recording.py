@@ -6,6 +6,7 @@ The readers are rosbags and mcap, none of them written here.  What a slow, full 
 does: test_world.py and test_failing_calls.py.
 """
 
+import errno
 import json
 import os
 import random
@@ -34,6 +35,7 @@ from spinning_top_sim.recording.errors import MAX_BYTES
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder, single
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, qos_profiles
+from spinning_top_sim.recording.writer import McapWriter
 
 
 def record(path, messages, topics=TOPICS, metadata=METADATA.copy, **options):
@@ -189,6 +191,23 @@ def test_too_little_space_leaves_no_file_and_holds_nobody_up(tmp_path, monkeypat
     assert recorder.room and not list(tmp_path.iterdir())
 
 
+def test_what_a_full_disk_took_of_a_chunk_is_cut_off_behind_the_summary(tmp_path, monkeypatch):
+    def full(descriptor, data, offset):
+        if len(data) < 1_000_000:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        return write(descriptor, data[:len(data) // 2], offset)
+
+    write, path = os.pwrite, tmp_path / 'run.mcap'
+    file = McapWriter(path, TOPICS, METADATA, compression='none')
+    file.add(*single(0, 1, bytes(1_000_000)))       # longer than the summary
+    with monkeypatch.context() as patch, pytest.raises(OSError, match='No space'):
+        patch.setattr(os, 'pwrite', full)
+        file.flush()
+    file.finish()
+    with LogReader(path) as reader:
+        assert reader.whole
+
+
 def test_a_failure_ends_the_wait_for_room(tmp_path, monkeypatch):
     def live():
         recorder = Recorder(f'{tmp_path}/none/a.mcap', TOPICS, dict, threads=machine)
@@ -228,7 +247,7 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     (tmp_path / 'old').mkdir()
     dated = r'spinning_top_\d{4}(-\d\d){2}_\d\d(-\d\d){2}_\d{6}\.mcap'
     for uri, path in (('run.mcap', r'run\.mcap'), ('new/er/', f'new/er/{dated}'),
-                      ('~/old', f'old/{dated}'), ('', dated), ('', dated)):
+                      ('~/old', f'old/{dated}'), ('plain', 'plain'), ('', dated), ('', dated)):
         recorder = record(uri, [])
         assert re.fullmatch(f'{tmp_path}/{path}', str(recorder.path))
         with LogReader(recorder.path) as reader:
@@ -242,4 +261,4 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     assert twice.error == "topic '/top/pose' is listed twice: once is allowed"
     long = record('long.mcap', [], metadata=lambda: {'history': MAX_BYTES * ' '})
     assert 'too many events' in long.error and not (tmp_path / 'long.mcap').exists()
-    assert (tmp_path / 'run.mcap').read_bytes() == content and len(forgotten) == 10
+    assert (tmp_path / 'run.mcap').read_bytes() == content and len(forgotten) == 11

@@ -221,6 +221,11 @@ def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
 FIRST, SECOND = message(5, b'first'), message(5, b'second' * 50)
 
 
+def test_a_chunk_may_be_several_frames(tmp_path):
+    frames = b''.join(map(zstandard.compress, (FIRST, SECOND)))
+    assert len(seen_by_us(closed(tmp_path, chunk_of(FIRST + SECOND, 'zstd', frames)))) == 2
+
+
 @pytest.mark.parametrize('bad', [
     chunk_of(FIRST, 'zstd', zstandard.compress(FIRST + SECOND), uncompressed_crc=0),   # too much
     chunk_of(bytes(9 << 16), 'lz4', lz4.frame.compress(bytes(9 << 16))),

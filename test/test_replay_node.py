@@ -27,6 +27,7 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 
@@ -230,22 +231,26 @@ def test_each_round_begins_with_the_clock_of_its_begin(tmp_path):
     assert rounds >= 2
 
 
-def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path):
+@pytest.mark.parametrize('has_clock', [False, True])
+def test_only_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path, has_clock):
     messages = []
     for time_ns in range(EPOCH_NS, EPOCH_NS + SECOND // 5 + 1, SECOND // 100):
         header = Header(stamp=Time(nanoseconds=time_ns).to_msg(), frame_id='world')
         messages += [(0, time_ns, serialize_message(PathMessage(
             header=header, poses=[PoseStamped(header=header), PoseStamped()]))),
-            (1, time_ns, text(7))]
+            (1, time_ns, text(7)),
+            *has_clock * [(2, time_ns, serialize_message(Clock(clock=header.stamp)))]]
     path = write_log(tmp_path / 'run.mcap', messages, [
-        ('/path', 'nav_msgs/msg/Path'), ('/chatter', STRING)])
+        ('/path', 'nav_msgs/msg/Path'), ('/chatter', STRING),
+        *has_clock * [('/clock', 'rosgraph_msgs/msg/Clock')]])
     with OwnReplay(path, '--loop') as replay:
         replay.spin_until('three rounds', lambda: len(replay.of('/path')) >= 60)
     assert set(replay.of('/chatter')) == {text(7)}, 'what has no stamps keeps its bytes'
     paths = [one if isinstance(one, PathMessage) else deserialize_message(one, PathMessage)
              for one in replay.of('/path')]
     stamps = [Time.from_msg(one.header.stamp).nanoseconds for one in paths]
-    assert stamps == [EPOCH_NS + n * SECOND // 100 for n in range(len(stamps))]
+    assert stamps == [EPOCH_NS + (n % 21 if has_clock else n) * SECOND // 100
+                      for n in range(len(stamps))]
     assert all(one.poses[0].header.stamp == one.header.stamp for one in paths)
     assert all(one.poses[1].header.stamp.nanosec == 0 for one in paths), '0 is no time'
 

@@ -43,9 +43,11 @@ def test_each_message_is_labelled_with_its_true_time():
 
 def test_one_imu_has_one_clock_and_one_noise_at_whatever_rate_it_is_read():
     noise = {'imu.gyroscope_noise_density': 2e-4, 'imu.gyroscope_random_walk': 2e-4}
-    _, found = run({**FAULTS, **noise, 'imu_data.rate': 100.0}, 3 * SECOND,
-                   'imu/data_raw', 'imu/data')
-    (raw_ns, *raw), (times_ns, *data) = found.values()
+    _, found = run({**FAULTS, **noise, 'imu_data.rate': 100.0, 'increments.enabled': True},
+                   3 * SECOND, 'imu/data_raw', 'imu/data', 'imu/dq', 'imu/dv')
+    (raw_ns, *raw), (times_ns, *data), *increments = found.values()
+    for one in increments:
+        assert np.array_equal(one[:2], (raw_ns, raw[0])), 'times and stamps'
     both = raw_ns % (2 * PERIOD_NS) == 0
     assert np.array_equal(raw_ns[both], times_ns)
     for column in (0, -2, -1):          # stamps, rates and forces

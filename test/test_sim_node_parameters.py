@@ -57,6 +57,7 @@ def test_a_spin_that_is_set_beside_the_start_is_that_of_the_next_start(node, cap
     assert 'initial.theta: a change takes effect at the next ~/reset' in capfd.readouterr().err
     assert node.loop.commands == 0 and node.trigger('reset').success
     assert node.get('spin.l3') == [2.0] and node.simulation.state().theta == 0.5
+    assert node.set(initial__phi=0.25, spin__l3=2.5).successful and node.loop.commands == 0
 
 
 REFUSED_COMMANDS = {

@@ -85,8 +85,9 @@ def test_what_cannot_be_started_is_said_in_a_line_with_exit_code_2(
 def test_a_run_warns_of_what_is_odd_and_tells_where_its_log_is(main, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     run = main('-p', 'record.enabled:=true', '-p', 'duration:=0.5', '-p', 'status_period:=0.1',
-               '-p', 'top.lambda3:=0.5', '--ros-args', '-p', 'spin.l33:=1.0', '-r',
-               'pose:=attitude', '-p', 'qos_overrides./attitude.publisher.depth:=3', '-p',
+               '-p', 'top.lambda3:=0.5', '-p', 'qos_overrides./attitude.publisher.depth:=4',
+               '--ros-args', '-p', 'spin.l33:=1.0', '-r', 'pose:=attitude', '-p',
+               'qos_overrides./attitude.publisher.depth:=3', '-p',
                'qos_overrides./pose.publisher.depth:=3')
     assert (run.code, TRACEBACK in run.err) == (0, False)
     path = the_log(tmp_path)
