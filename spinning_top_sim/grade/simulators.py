@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from numbers import Real
 from typing import Any
@@ -75,7 +75,7 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
     subject = one_line(getattr(run, '__name__', type(run).__name__))
     unjudged += [f'{name}: there is none' for name in DENSITIES for motion in judgement.motions[:1]
-                 if name not in motion.told.readings]
+                 if name not in motion.readings]
     return Report(subject, judgement.faults, unjudged=unjudged).plus(*judgement.reports())
 
 
@@ -94,23 +94,15 @@ def told_motion(run: Simulate, body: Body, start: Start, times: Reals, dt: float
                    {name: white(values, jumps=False) for name, values in readings.items()})
 
 
-@dataclass
-class Motion:
-    """What is told of a motion."""
-
-    name: str
-    told: Stretch
-    worst: float                # its largest angle to the exact attitudes [rad]
-    slow: bool                  # whether it is the right motion at another rate, at first
-
-
 class Judgement:
     """Motions of a body beside the exact ones; `reports` judges them."""
 
     def __init__(self, body: Body, dt: float, tolerance: float) -> None:
-        self.body, self.dt, self.tolerance = body, dt, tolerance
-        self.motions: list[Motion] = []
-        self.faults: list[Finding] = []
+        self.body, self.dt, self.limit = body, dt, math.degrees(tolerance)
+        self.motions, self.faults = list[Stretch](), list[Finding]()
+        self.marks: dict[str, Mark] = {}
+        # The largest error [deg], of which motion, whether it is at another rate, at first.
+        self.worst = 0.0, '', False
 
     def add(self, name: str, start: State, told: Stretch) -> None:
         """Add a motion; a convention of its attitudes, or a step, is told and undone."""
@@ -138,39 +130,35 @@ class Judgement:
                 'late' if late > 0.0 else 'early', f'{name}: the attitudes are those of '
                 f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
             exact = Rotation.from_quat(solution.states(told.t - late * self.dt).quaternion)
-        worst = float(np.max((exact.inv() * told.rotation).magnitude()))
-        self.motions.append(Motion(name, told, worst, explained and abs(late) < LATE))
+        error = math.degrees(np.max((exact.inv() * told.rotation).magnitude()))
+        self.motions.append(told)
+        self.marks[f'total_error_deg: {name}'] = Mark(error, self.limit)
+        self.worst = max(self.worst, (error, name, explained and abs(late) < LATE))
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
         if not self.motions:
             return
-        worst = max(self.motions, key=lambda motion: motion.worst)
-        wrong, of_rates = worst.worst > self.tolerance, self._readings('rates')
+        error, name, slow = self.worst
+        wrong, of_rates = error > self.limit, self._readings('rates')
         scaled = wrong and [one.name for one in of_rates.found] == ['rates_scale']
         if scaled or not (of_rates.found or of_rates.unjudged):     # what is told is known
-            for motion in self.motions:
-                motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
+            self.motions = [replace(motion, rates=motion.readings.get('rates'))
+                            for motion in self.motions]
         yield Report('', of_rates.found, unjudged=of_rates.unjudged)
-        found = [] if worst.slow or not wrong else _equations(
-            self.body, [motion.told for motion in self.motions])
-        error, limit = math.degrees(worst.worst), math.degrees(self.tolerance)
-        text = f'{worst.name}: the attitude is up to {error:.3g} deg off'
+        found = [] if slow or not wrong else _equations(self.body, self.motions)
+        text = f'{name}: the attitude is up to {error:.3g} deg off'
         yield Report('', [one._replace(evidence=f'{text}; {one.evidence}') for one in found] or [
-            Finding('inaccurate', text, error)] * (wrong and not scaled), {
-                f'total_error_deg: {motion.name}': Mark(math.degrees(motion.worst), limit)
-                for motion in self.motions})
+            Finding('inaccurate', text, error)] * (wrong and not scaled), self.marks)
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
-        return judge(kind, [one.told for one in self.motions], self.body, self.body.gravity)
+        return judge(kind, self.motions, self.body, self.body.gravity)
 
 
 def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
     """Return what is wrong with the change of rates in each step, where no errors add up."""
     model = Model([_terms(body, motion) for motion in motions])
-    if model.size(TARGET) < UNIMPORTANT:
-        return []
     found, rest = explain(model, [
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(
@@ -179,7 +167,7 @@ def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
             'damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the axis '
             f'and {found[1]:.3g} 1/s about it', float(found[0]))),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
-        Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
+        Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))], UNIMPORTANT)
     return found if rest.rest < UNEXPLAINED * model.size(TARGET) else []
 
 
