@@ -12,7 +12,6 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import columns
 from spinning_top_sim.grade.columns import AXES, DENSITIES, ENTRIES, OF_TURNS, Comparison, Imu
 from spinning_top_sim.tools import identify
 from spinning_top_sim.tools.identify import NEAR, NO_FAULT, SURE, Cause, Fit, Model
@@ -140,7 +139,7 @@ class Causes:
             return [*filter(None, [self._bias(bias.found) if sure else None])], right
         found, rest = identify.explain(self.model, [*self._causes(right.beyond)], 0.5 * STRANGE)
         # Where the terms cannot be seen, as in free fall, noise is.
-        seen = self.kind != 'accelerations' or self._clear('total')
+        seen = self.kind != 'accelerations' or self.model.clear('total', CLEARLY)
         if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange, 2.0 * rest.noise,
                              (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
             found = [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
@@ -175,16 +174,11 @@ class Causes:
             yield Cause(self.compared.matrix, lambda found: self._matrix(
                 AXES + found[-9:].reshape(3, 3)))
 
-    def _clear(self, name: str) -> bool:
-        """Return whether an effect is much larger than its noise."""
-        return not self.noisy or self.model.clear(name, CLEARLY)
-
     def _term(self, term: str, found: Reals) -> Finding | None:
         """Judge the size of a term."""
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:z.4f} times its size'
-        # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self._clear(term) or abs(share * columns.STANDARD_GRAVITY - 1.0) < LIKE:
+        if not self.model.clear(term, CLEARLY):     # a term of noise seems to be missing
             return None
         if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
             millimetres = term == 'linear' and abs(1e3 * share - 1.0) < LIKE
@@ -192,8 +186,8 @@ class Causes:
         if share < 0.0:
             return Finding('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
         if term == 'gravity':
-            return Finding('gravity' * (abs(share - 1.0) > GRAVITY_BAND and self._clear('total')),
-                           text, share)
+            clear = self.model.clear('total', CLEARLY)
+            return Finding('gravity' * (clear and abs(share - 1.0) > GRAVITY_BAND), text, share)
         # Noise that is not white makes it smaller.
         return Finding('acceleration_scale' * (not self.noisy), text, share)
 
@@ -231,15 +225,13 @@ class Causes:
     def _matrix(self, matrix: Reals) -> Finding | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
         change = float(np.max(np.abs(matrix - AXES)))
-        if np.max(np.abs(matrix)) < STRANGE:    # they are something else
+        if np.linalg.det(matrix) <= STRANGE ** 3:   # they are something else
             return None
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             name, small = ('rates_scale', STRANGE) if self.kind == 'rates' else (
                 'reading_scale', max(self.strange, GRAVITY_BAND * (self.kind == 'accelerations')))
             return Finding(name * (change > small), f'the readings are {matrix[0, 0]:.4g} times '
                            'what they should be', matrix[0, 0])
-        if np.linalg.det(matrix) <= 0.0:
-            return None
         turn = Rotation.from_matrix(matrix)
         angle, near = float(turn.magnitude()), max(REAL, OF_TURN * change)
         return Finding('mounting', 'the axes of the readings are turned by '

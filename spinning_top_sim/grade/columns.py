@@ -18,7 +18,6 @@ from spinning_top_sim.tools.report import Finding
 UP, AXES = np.array((0.0, 0.0, 1.0)), np.eye(3)
 ENTRIES = [(i, j) for i in range(3) for j in range(3)]
 STANDARD_GRAVITY = 9.80665
-NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR, NOISY = 0.03, 1e-3   # noise of rates or forces, relative: small enough; not negligible
 ARM = np.full(3, 0.06)  # of an IMU whose place is not known [m]
 # Signed permutations, the simplest first.
@@ -183,8 +182,7 @@ class Comparison:
             for motion, parts in zip(pair, (plain, noisy), strict=True):
                 effects = self.columns(motion)
                 read = self.read(motion, lag)
-                effects |= {TARGET: read - effects['total'], 'step': np.gradient(
-                    read if self.noisy else effects.get('whole', read), axis=0)}
+                effects |= {TARGET: read - effects['total'], 'step': np.gradient(read, axis=0)}
                 parts.append({name: one[keep][smooth] / size for name, one in effects.items()})
         return Model(plain, noisy, self.always)
 
@@ -196,7 +194,7 @@ class Comparison:
             effects = {f'field {k}': motion.back @ axis for k, axis in enumerate(AXES)}
             effects['total'] = motion.back @ self.field
         else:
-            effects = dict.fromkeys(('rates', 'total', 'whole'), motion.rates)
+            effects = dict.fromkeys(('rates', 'total'), motion.rates)
         total = effects['total']
 
         def turned(reading: Reals) -> Reals:
@@ -219,7 +217,7 @@ class Comparison:
         gravity, moved = self.gravity * motion.back @ UP, motion.acceleration + second @ self.arm
         return {
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
-            'linear': motion.acceleration, 'lever': second @ self.arm, 'whole': gravity + moved,
+            'linear': motion.acceleration, 'lever': second @ self.arm,
             'total': gravity + (motion.acceleration if self.always else moved),
             'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.

@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from spinning_top_sim.grade.columns import NORM, READINGS
+from spinning_top_sim.grade.columns import READINGS
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.table import Columns, read_columns
 from spinning_top_sim.times import NEVER_NS, stamp_text
@@ -106,7 +106,7 @@ class Recorded:
 def unit(attitudes: Reals, rows: Sequence[str]) -> Reals:
     """Return quaternions (n, 4), normalized.  ValueError, by the name of a row: they are none."""
     norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
-    for row in np.flatnonzero(np.abs(norms - 1.0) >= NORM)[:1]:
+    for row in np.flatnonzero(np.abs(norms - 1.0) >= 0.01)[:1]:
         raise ValueError(f'{rows[row]}: |q| = {norms[row, 0]:.4g}: must be 1')
     return attitudes / norms
 

@@ -31,7 +31,7 @@ EARLY = 24              # samples at the start by which a convention is known
 RIGHT = 0.1             # share of an error that the right convention, or time, leaves
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
-UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
+UNIMPORTANT = 1e-4  # of the angular acceleration, that needs no cause
 SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
