@@ -178,7 +178,8 @@ class Causes:
         """Judge the size of a term."""
         share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:z.4f} times its size'
-        if not self.model.clear(term, CLEARLY):     # a term of noise seems to be missing
+        # A term of noise seems to be missing; gravity is in g where the whole reading is.
+        if not self.model.clear(term, CLEARLY) or abs(share * self.compared.units['g'] - 1.0) < LIKE:
             return None
         if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
             millimetres = term == 'linear' and abs(1e3 * share - 1.0) < LIKE
