@@ -137,23 +137,21 @@ class Causes:
             size = float(np.linalg.norm(bias.found[-3:])) * self.model.size(OFFSETS[0])
             sure = size > STRANGE and np.any((np.abs(bias.found) > SURE * bias.sigma)[-3:])
             return [*filter(None, [self._bias(bias.found) if sure else None])], right
-        found, rest = identify.explain(self.model, [*self._causes(right.beyond)], 0.5 * STRANGE)
+        found, rest = identify.explain(self.model, [*self._causes()], 0.5 * STRANGE)
         # Where the terms cannot be seen, as in free fall, noise is.
         seen = self.kind != 'accelerations' or self.model.clear('total', CLEARLY)
-        if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange, 2.0 * rest.noise,
-                             (UNEXPLAINED + 2.0 * rest.noise) * self.noisy):
+        if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange,
+                             UNEXPLAINED * self.noisy + 2.0 * rest.noise):
             found = [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
                              'that of the motion', rest.beyond)] * seen
         return found, rest
 
-    def _causes(self, before: float) -> Iterator[Cause]:
+    def _causes(self) -> Iterator[Cause]:
         for name in TERMS if self.kind == 'accelerations' else ():
             if not self.arms or name in ('gravity', 'linear'):
                 yield Cause([name], partial(self._term, name))
         yield Cause(['total'], lambda found: self._matrix((1.0 + found[-1]) * AXES))
         yield Cause(['step'])
-        if self.kind == 'rates' and before <= self.strange:      # their size is known as well
-            return
         if self.kind == 'accelerations':
             yield Cause(['difference'], lambda found: Finding(
                 'finite_differences', 'the acceleration, without gravity, is a difference of '
@@ -176,10 +174,10 @@ class Causes:
 
     def _term(self, term: str, found: Reals) -> Finding | None:
         """Judge the size of a term."""
-        share = 1.0 + float(found[-1])
+        share, g = 1.0 + float(found[-1]), self.compared.units['g']
         text = f'the term {term} has {share:z.4f} times its size'
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self.model.clear(term, CLEARLY) or abs(share * self.compared.units['g'] - 1.0) < LIKE:
+        if not self.model.clear(term, CLEARLY) or abs(share * g - 1.0) < LIKE:
             return None
         if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
             millimetres = term == 'linear' and abs(1e3 * share - 1.0) < LIKE
