@@ -14,6 +14,7 @@ from spinning_top_sim.grade.files import PARTS, Recorded, known
 from spinning_top_sim.physics.top import numbers
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
+from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.kinematics import MOST, Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
@@ -100,9 +101,11 @@ def held(name: str, values: Reals) -> tuple[NDArray[np.bool_], list[Finding]]:
 
 def smooth(values: Reals) -> NDArray[np.bool_]:
     """Return which poses (n, k) are not beside a jump, a step unlike others and those beside."""
-    steps = np.linalg.norm(np.diff(np.abs(values), axis=0), axis=1)     # q and -q are one
+    values = np.abs(values) if values.shape[1] == 4 else values     # q and -q are one
+    steps = np.linalg.norm(np.diff(values, axis=0), axis=1)
     beside = np.maximum(np.append(steps[1:], 0.0), np.append(0.0, steps[:-1]))
-    jumps = steps > JUMP * np.maximum(beside, np.median(steps)) + 1e-9
+    usual = float(np.median(steps)) or rms(steps)       # places may be rounded
+    jumps = steps > JUMP * np.maximum(beside, usual) + 1e-9
     return ~(np.append(False, jumps) | np.append(jumps, False))
 
 

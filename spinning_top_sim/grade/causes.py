@@ -87,8 +87,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
 
 def cost(found: Sequence[Finding]) -> int:
     """Return how unlikely faults are: the more, the less explained, the more free numbers."""
-    return sum({'inaccurate': 18, 'bias': 3, 'gravity': 3, 'mounting': 3, 'reading_scale': 3}.get(
-        one.name, 2) for one in found)
+    free = 'bias', 'gravity', 'mounting', 'rates_scale', 'reading_scale'
+    return sum(18 if one.name == 'inaccurate' else 2 + (one.name in free) for one in found)
 
 
 def _explained(compared: Comparison, lag: int) -> tuple[Model, list[Finding], Fit]:

@@ -67,7 +67,11 @@ class Imu:
 
     def __post_init__(self) -> None:
         for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
-            numbers(name, getattr(self, name) or [0.0] * length, length)
+            if (value := getattr(self, name)) is not None:
+                vars(self)[name] = tuple(numbers(name, value, length).tolist())
+        for name in DENSITIES.values():
+            if not (getattr(self, name) is None or getattr(self, name) >= 0.0):
+                raise ValueError(f'{name} = {getattr(self, name)!r}: must be 0 or positive')
         if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
             raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
 
@@ -88,8 +92,10 @@ class Comparison:
         self.exchange = AXES        # by which what is read is multiplied, and the fault of that
         self.told: list[Finding] = []
         self.mounting = Rotation.from_quat((0, 0, 0, 1) if kind == 'rates' else imu.mounting)
-        stretches = [one for one in stretches if kind in one.readings]
-        sizes = [rms(one.readings[kind]) for one in stretches]
+        stretches = [one for one in stretches
+                     if kind in one.readings and len(one.t) >= 4 * kinematics.margin(1)]
+        of_field = rms(self.field) * (kind == 'magnetometer')       # readings may be zeros
+        sizes = [max(rms(one.readings[kind]), of_field) for one in stretches]
         least = 0.1 if kind in OF_TURNS else 0.01       # at rest there are no rates, but gravity
         self.sizes = np.maximum(sizes, least * max(sizes, default=0.0) or 1.0)
         self.reading_noise = rms(np.array([one.sigma.get(kind, 0.0) for one in stretches] or [0]))
@@ -131,6 +137,7 @@ class Comparison:
     def lag(self) -> int:
         """Return by how many samples readings are late, 0 where no other number is clear."""
         motions, residuals = [one for one, _ in self.motions], []
+        motions = [one for one in motions if len(one.rates) > 4 * LAGS[-1]] or motions
         lags = [lag for lag in LAGS if 4 * abs(lag) < min(len(one.rates) for one in motions)]
         for motion in motions:      # by all terms, of all axes: what else is wrong does not count
             good = np.flatnonzero(motion.smooth)
@@ -163,10 +170,13 @@ class Comparison:
         sizes = np.array([np.append(-1.0 / unit, axes) for _, unit, axes in tried])
         rest = np.sqrt(np.maximum(np.sum(sizes @ squares * sizes, axis=1), 0.0))
         good = rest <= conventions.AS_GOOD * np.min(rest) + EXACT * math.sqrt(squares[0, 0])
+        good &= rest ** 2 < np.trace(squares[1:, 1:]) / 3.0     # less is left than was read
         called, unit, axes = tried[int(np.argmax(good))]
         other = copy(self)
         other.exchange, other.sizes = unit * axes, unit * self.sizes
         other.reading_noise *= unit
+        if other.arms:
+            other.arm = other.model(lag).fit([]).found
         name = 'axes' if np.trace(np.abs(axes)) < 3.0 else (
             {3.0: 'units', -3.0: 'reading_sign'}.get(float(np.trace(axes)), 'sign'))
         other.told = [Finding(name, f'the readings are {1.0 / unit:.4g} times the right ones, '

@@ -84,6 +84,7 @@ def _of_motion(recorded: Recorded, values: Mapping[str, Any], run: Any) -> Repor
     """Return a report on the motion of a top beside the exact one."""
     bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
     body = max(bodies, key=lambda one: len(one.t), default=None)
+    untold = [f'the motion: {len(bodies) - 1} shorter parts between gaps'] * (len(bodies) > 1)
     tolerance, notes = TOLERANCE + NOISES * (body.sigma['attitudes'] if body else math.inf), []
     if not body or body.coarse or tolerance > MOST:
         return Report('', unjudged=['the motion: too few poses, or too much noise'])
@@ -94,7 +95,8 @@ def _of_motion(recorded: Recorded, values: Mapping[str, Any], run: Any) -> Repor
         worst = math.degrees(np.max((truth.inv() * body.rotation).magnitude()))
         limit = math.degrees(tolerance)
         found = [Finding('inaccurate', f'the attitude is up to {worst:.3g} deg off', worst)]
-        return Report('', found * (worst > limit), {'total_error_deg': Mark(worst, limit)})
+        return Report('', found * (worst > limit), {'total_error_deg': Mark(worst, limit)},
+                      unjudged=untold)
     top = Body(**vars(parameters.top_of(values)))
     start, told = Start.of(top, parameters.start_state(values)), body.rotation.as_quat()
     body = replace(body, t=body.t - body.t[0])
@@ -106,7 +108,7 @@ def _of_motion(recorded: Recorded, values: Mapping[str, Any], run: Any) -> Repor
         body = replace(body, t=body.t - body.t[at])
     judgement = Judgement(top, body.step, tolerance)
     judgement.add('the motion', start, body)
-    return Report('', judgement.faults, {}, notes).plus(*judgement.reports())
+    return Report('', judgement.faults, {}, notes, unjudged=untold).plus(*judgement.reports())
 
 
 main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

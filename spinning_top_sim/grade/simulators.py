@@ -74,8 +74,9 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body | None = None,
             except ValueError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
     subject = one_line(getattr(run, '__name__', type(run).__name__))
-    unjudged += [f'{name}: there is none' for name in DENSITIES for motion in judgement.motions[:1]
-                 if name not in motion.readings]
+    for name in DENSITIES:
+        without = sum(name not in motion.readings for motion in judgement.motions)
+        unjudged += [f'{name}: there is none in {without} scenes'] * bool(without)
     return Report(subject, judgement.faults, unjudged=unjudged).plus(*judgement.reports())
 
 
