@@ -206,7 +206,7 @@ def test_short_parts_jumps_and_coarse_places_change_nothing_and_zeros_are_no_uni
     assert grade_readings(cut).faults == ['late']
     mirrored = places - 2.0 * places[300] * (t >= t[300])[:, np.newaxis]
     assert grade_readings({**parts, 'positions': (t, mirrored)}).passed
-    coarse = np.round(5e-3 * places, 3)
+    coarse = np.round(1e-3 * places, 3)
     assert grade_readings({**parts, 'positions': (t, coarse)}).marks
     known = Imu(field=(0.0, 2e-5, -4e-5))
     for name in ('gyroscope', 'accelerations', 'magnetometer'):
