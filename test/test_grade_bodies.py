@@ -198,15 +198,12 @@ def test_held_poses_are_told_and_a_body_that_rests_is_not_held():
     assert held('gyroscope', np.repeat(moving, 2, axis=0))[1][0].number == 2.0
 
 
-def test_short_parts_jumps_and_coarse_places_change_nothing_and_zeros_are_no_units():
+def test_short_parts_and_coarse_places_change_nothing_and_zeros_are_no_units():
     parts = told(body(4, noisy=False, seconds=5.0, kind='forced', rate=100.0))
     (t, w), (_, places) = parts['gyroscope'], parts['positions']
     cut = {name: tuple(np.delete(one, np.s_[65:75], axis=0) for one in pair)
            for name, pair in {**parts, 'gyroscope': (t, rolled(w, 20))}.items()}
     assert grade_readings(cut).faults == ['late']
-    far = int(np.argmax(np.linalg.norm(places, axis=1)))
-    mirrored = places - 2.0 * places[far] * (t >= t[far])[:, np.newaxis]
-    assert grade_readings({**parts, 'positions': (t, mirrored)}).passed
     coarse = np.round(5e-3 * places, 3)
     assert grade_readings({**parts, 'positions': (t, coarse)}).marks
     known = Imu(field=(0.0, 2e-5, -4e-5))
