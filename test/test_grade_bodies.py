@@ -206,7 +206,7 @@ def test_short_parts_and_coarse_places_change_nothing_and_zeros_are_no_units():
     assert grade_readings(cut).faults == ['late']
     coarse = np.round(5e-3 * places, 3)
     assert grade_readings({**parts, 'positions': (t, coarse)}).marks
-    known = Imu(field=(0.0, 2e-5, -4e-5))
+    known = Imu(lever_arm=(0.1, 0.2, 0.3), field=(0.0, 2e-5, -4e-5))
     for name in ('gyroscope', 'accelerations', 'magnetometer'):
         faults = grade_readings({**parts, name: (t, 0.0 * w)}, known).faults
         assert 'units' not in faults and faults, (name, faults)
