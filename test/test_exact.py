@@ -22,7 +22,6 @@ from helpers.reference import CASES, ROOT, start_of, top_of
 from helpers.tops import EXACT, check_motion, time_limit
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers import solve as solve_module
 from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution, exact_about
 from spinning_top_sim.solvers.handover import Piece
@@ -118,25 +117,6 @@ def test_a_range_has_the_bits_of_its_times_in_any_pieces(motion):
             part = slice(len(times) // 3, len(times) // 3 + 40)
             assert getattr(solution.states(times[part]), column).tobytes() == (
                 expected[part].tobytes())
-
-
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-@pytest.mark.parametrize('state', [
-    start(2.0, 9.0, l3=0.0, lz=0.0), start(2.0, -9.0, l3=0.0, lz=0.0),
-    start(1.0, -7.0, l3=0.5, lz=0.5)])
-def test_angles_go_on_from_a_state_beyond_a_pole(method, state):
-    """As from the state that a command leaves."""
-    motion, then = motion_of(UNIT, state, method=method), np.array([0.0, 0.3, 1.1])
-    for t in (0.4, 0.9, 1.7):
-        now = motion.states(np.array([t]))
-        angles = {name: float(getattr(now, name)[0]) for name in (
-            'theta', 'theta_dot', 'phi', 'psi')}
-        found = motion_of(UNIT, ContinuedState(l3=state.l3, lz=state.lz, **angles),
-                          method=method).states(then)
-        expected = motion_of(UNIT, state, method=method).states(t + then)
-        for name in (*angles, 'quaternion'):
-            assert getattr(found, name) == pytest.approx(
-                getattr(expected, name), abs=1e-13 if method == 'exact' else 1e-7), name
 
 
 @pytest.mark.parametrize('method', ['exact', 'rk45'])

@@ -78,13 +78,6 @@ def test_a_filter_without_an_estimate_of_a_bias_is_right_unless_it_reports_one(r
     assert found.measures['bias_tilt_s'] == pytest.approx(2.0, rel=0.1)
 
 
-def test_a_convention_is_undone_for_the_other_checks(report):
-    found, right = report('w first, NED'), report('vqf')
-    assert 'read as w, x, y, z, world north-east-down' in found.found[0].evidence
-    for name in ('rates_off', 'clean_deg', 'lever_arm', 'tilt_rms_deg'):
-        assert found.measures[name] == pytest.approx(right.measures[name], abs=1e-6)
-
-
 def test_what_a_fault_hides_and_the_shift_of_the_force_are_said(report):
     found = report('rates negated')
     assert found.notes[0].startswith('not judged because of this: rest_deg, delay')
