@@ -93,6 +93,8 @@ def cost(found: Sequence[Finding]) -> int:
 
 def _explained(compared: Comparison, lag: int) -> tuple[Model, list[Finding], Fit]:
     """Return the model of readings that are late, the faults that explain them, what is left."""
+    if compared.arms:
+        compared.arm = compared.model(lag).fit([]).found
     model = compared.model(lag)
     if compared.kind == 'accelerations':
         right, local = model.fit([]), model.fit(['gravity'])
@@ -138,12 +140,10 @@ class Causes:
             sure = size > STRANGE and np.any((np.abs(bias.found) > SURE * bias.sigma)[-3:])
             return [*filter(None, [self._bias(bias.found) if sure else None])], right
         found, rest = identify.explain(self.model, [*self._causes()], 0.5 * STRANGE)
-        # Where the terms cannot be seen, as in free fall, noise is.
-        seen = self.kind != 'accelerations' or self.model.clear('total', CLEARLY)
         if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange,
                              UNEXPLAINED * self.noisy + 2.0 * rest.noise):
             found = [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
-                             'that of the motion', rest.beyond)] * seen
+                             'that of the motion', rest.beyond)]
         return found, rest
 
     def _causes(self) -> Iterator[Cause]:

@@ -104,8 +104,6 @@ class Comparison:
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
         self.stepped = any(one.rates is None and not one.intervals for one in stretches)
         self.motions, self.noisy = self._clear(stretches, widths)
-        if self.arms and self.motions:
-            self.arm = self.model(0).fit([]).found
 
     def _clear(self, stretches: Sequence[Stretch], widths: Sequence[int],
                ) -> tuple[list[tuple[Smoothed, Smoothed]], bool]:
@@ -175,8 +173,6 @@ class Comparison:
         other = copy(self)
         other.exchange, other.sizes = unit * axes, unit * self.sizes
         other.reading_noise *= unit
-        if other.arms:
-            other.arm = other.model(lag).fit([]).found
         name = 'axes' if np.trace(np.abs(axes)) < 3.0 else (
             {3.0: 'units', -3.0: 'reading_sign'}.get(float(np.trace(axes)), 'sign'))
         other.told = [Finding(name, f'the readings are {1.0 / unit:.4g} times the right ones, '
