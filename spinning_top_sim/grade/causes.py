@@ -87,7 +87,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
 
 def cost(found: Sequence[Finding]) -> int:
     """Return how unlikely faults are: the more, the less explained, the more free numbers."""
-    free = 'bias', 'gravity', 'mounting', 'rates_scale', 'reading_scale'
+    free = 'bias', 'gravity', 'mounting', 'no_lever_arm', 'rates_scale', 'reading_scale'
     return sum(18 if one.name == 'inaccurate' else 2 + (one.name in free) for one in found)
 
 
@@ -174,10 +174,9 @@ class Causes:
 
     def _term(self, term: str, found: Reals) -> Finding | None:
         """Judge the size of a term."""
-        share, g = 1.0 + float(found[-1]), self.compared.units['g']
+        share = 1.0 + float(found[-1])
         text = f'the term {term} has {share:z.4f} times its size'
-        # A term of noise seems to be missing; gravity is in g where the whole reading is.
-        if not self.model.clear(term, CLEARLY) or abs(share * g - 1.0) < LIKE:
+        if not self.model.clear(term, CLEARLY):     # a term of noise seems to be missing
             return None
         if abs(share) < NEAR and not (term == 'gravity' and share > ELSEWHERE):
             millimetres = term == 'linear' and abs(1e3 * share - 1.0) < LIKE
@@ -193,9 +192,6 @@ class Causes:
     def _arm(self, found: Reals) -> Finding | None:
         """Judge where the IMU is."""
         arm, point = self.compared.arm, found[-3:] + self.compared.arm
-        share = float(point @ arm) / (float(arm @ arm) or 1.0)
-        if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * np.linalg.norm(point):
-            return self._term('lever', np.array([share - 1.0]))
         return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
                        f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
 
