@@ -168,9 +168,8 @@ class Causes:
                 ([*arms, 'total', 'reversed'], 'rotation_reversed', 'the IMU turns backwards')):
             if effects[-1] in self.model.names:
                 yield Cause(effects, identify.instead(name, text))
-        if self.arms or not self.compared.always:   # of an unknown field it is no product
-            yield Cause(self.compared.matrix, lambda found: self._matrix(
-                AXES + found[-9:].reshape(3, 3)))
+        yield Cause(self.compared.matrix, lambda found: self._matrix(
+            AXES + found[-9:].reshape(3, 3)))
 
     def _term(self, term: str, found: Reals) -> Finding | None:
         """Judge the size of a term."""
@@ -278,9 +277,9 @@ def _noise_faults(compared: Comparison, model: Model, rest: Fit,
     # Without noise of poses, all that is left is that of readings, or a fast motion.
     noise = compared.reading_noise if compared.noisy else min(
         compared.reading_noise, rest.rest / (math.sqrt(3.0) * model.size(OFFSETS[0])))
-    exists = noise > ROUNDING * float(np.min(compared.sizes))
     declared = math.nan if density is None else density / math.sqrt(compared.own_step)
-    ratio = noise / declared if declared else math.inf if exists else 1.0
-    if abs(ratio - 1.0) > NOISE_BAND + OF_CHANCE / math.sqrt(model.count):
+    band = NOISE_BAND + OF_CHANCE / math.sqrt(model.count)
+    if abs(noise - declared) > band * declared + ROUNDING * float(np.min(compared.sizes)):
+        ratio = noise / declared if declared else math.inf
         yield Finding('noise_scale', f'the noise has a standard deviation of {noise:.4g}, '
                       f'{ratio:.4g} times what is declared, {declared:.4g}', ratio)

@@ -96,8 +96,7 @@ class Comparison:
                      if kind in one.readings and len(one.t) >= 4 * kinematics.margin(1)]
         of_field = rms(self.field) * (kind == 'magnetometer')       # readings may be zeros
         sizes = [max(rms(one.readings[kind]), of_field) for one in stretches]
-        least = 0.1 if kind in OF_TURNS else 0.01       # at rest there are no rates, but gravity
-        self.sizes = np.maximum(sizes, least * max(sizes, default=0.0) or 1.0)
+        self.sizes = np.maximum(sizes, 0.1 * max(sizes, default=0.0) or 1.0)    # it may rest
         self.reading_noise = rms(np.array([one.sigma.get(kind, 0.0) for one in stretches] or [0]))
         # The interval of the sensor [s], and its samples per sample that is compared.
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
