@@ -87,7 +87,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
 
 def cost(found: Sequence[Finding]) -> int:
     """Return how unlikely faults are: the more, the less explained, the more free numbers."""
-    free = 'bias', 'gravity', 'mounting', 'no_lever_arm', 'rates_scale', 'reading_scale'
+    free = 'bias', 'gravity', 'mounting', 'rates_scale', 'reading_scale', *TERMS.values()
     return sum(18 if one.name == 'inaccurate' else 2 + (one.name in free) for one in found)
 
 
