@@ -6,9 +6,9 @@ The blocks of a page run in order, in one empty folder and one Python namespace.
 
 - `python` blocks are executed, unless their first line is a comment with the name of a file, such
   as `# my_filter.py`: then they are written to that file.  So are `yaml` blocks.
-- `bash` blocks are run by bash, but for plain commands of `spinning-top`, which are called here.
-  `<!-- background -->` in the line before keeps one running until the page ends; `<!-- exit code 1
-  -->` expects another than 0; `<!-- not run: REASON -->` leaves one out.
+- `bash` blocks are run by bash.  `<!-- background -->` in the line before keeps one running until
+  the page ends; `<!-- exit code 1 -->` expects another than 0; `<!-- not run: REASON -->` leaves
+  one out.
 - A `text` block right behind a block that ran is its output.  Integers are equal, other numbers
   agree within 2 %, and a line `...` stands for any lines.
 """
@@ -20,7 +20,6 @@ import math
 import os
 import re
 import runpy
-import shlex
 import signal
 import subprocess
 import sys
@@ -29,8 +28,6 @@ from typing import NamedTuple
 
 import pytest
 from helpers.reference import ROOT
-
-from spinning_top_sim.__main__ import main
 
 # Pages that Sphinx copies have no blocks of their own.
 PAGES = [path for path in (*ROOT.glob('*.md'), *sorted(ROOT.glob('docs/**/*.md')))
@@ -115,13 +112,6 @@ class Runner:
         return None
 
     def _shell(self, block):
-        commands = [shlex.split(line) for line in block.text.replace('\\\n', '').splitlines()]
-        if not block.mark and all(words[:1] == ['spinning-top'] and not {'|', '||', '>'} & {*words}
-                                  for words in commands):
-            # The command itself, without a start of Python.
-            with contextlib.redirect_stdout(io.StringIO()) as out:
-                assert [main(words[1:]) for words in commands] == [0] * len(commands), block
-            return out.getvalue()
         line = ['bash', '-euo', 'pipefail', '-c', block.text]
         if block.mark == 'background':
             self.running.callback(_ended, subprocess.Popen(
