@@ -234,19 +234,13 @@ def failure_of(plan):
 
 
 def told(seed):
-    """Return what is wrong with a seed and the few actions that suffice for that; '' if right."""
+    """Return what is wrong with a seed that fails, and the few actions that suffice for that."""
     plan = plan_of(seed)
-    numbers, size = [*range(len(plan.actions))], len(plan.actions)
-    if not failure_of(plan):
-        return ''
-    while size:
-        for begin in range(0, len(numbers), size):
-            fewer = numbers[:begin] + numbers[begin + size:]
-            if failure_of(plan.only(fewer)):
-                numbers = fewer
-                break
-        else:
-            size //= 2
+    numbers = [*range(len(plan.actions))]
+    for number in reversed(numbers):
+        fewer = [one for one in numbers if one != number]
+        if failure_of(plan.only(fewer)):
+            numbers = fewer
     plan = plan.only(numbers)
     ends = f', or in call {plan.kill_at} of the disk' if plan.kill_at else ''
     return '\n'.join((
