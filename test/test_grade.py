@@ -5,7 +5,6 @@ import math
 import re
 import sys
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -83,21 +82,14 @@ def test_rates_of_another_size_are_named_and_the_gyroscope_is_right():
     assert report.found[0].number == pytest.approx(1.005)
 
 
-def test_what_is_wrong_with_rates_may_have_all_causes_or_two_that_cannot_be_told_apart():
-    def run(top, start, times, dt, late=-0.4, scale=1.002, wave=0.02):
-        rates = scale * solve(top, start, times - late * dt).angular_velocity
+def test_what_is_wrong_with_rates_may_have_all_causes():
+    def run(top, start, times, dt):
+        rates = 1.002 * solve(top, start, times + 0.4 * dt).angular_velocity
         return {'attitudes': solve(top, start, times).quaternion,
-                'rates': rates + wave * np.sin(20.0 * times)[:, np.newaxis] * (1.0, 0.3, -0.5)}
+                'rates': rates + 0.02 * np.sin(20.0 * times)[:, np.newaxis] * (1.0, 0.3, -0.5)}
 
     report = grade(run, scenes=SCENES[1:2], dt=0.004)
     assert report.passed and 'rates' not in str(report.unjudged), report
-    # In steady precession rates of another time are turned ones.
-    tilt, l3, across = 1.2, 3.0, WHEEL.lambda1 * math.cos(1.2)
-    rate = max(np.roots((across, -l3, WHEEL.gravity_torque)))
-    lz = l3 * math.cos(tilt) + WHEEL.lambda1 * math.sin(tilt) ** 2 * rate
-    report = grade(partial(run, late=6.0, scale=1.0, wave=0.0),
-                   scenes=[Scene('steady', State(theta=tilt, l3=l3, lz=lz), 4.0)])
-    assert report.passed and 'does not tell' in str(report.unjudged), report
 
 
 def test_what_is_held_is_named_and_not_graded():
