@@ -29,7 +29,6 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header, String
-from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import replay_node, replayer
 from spinning_top_sim.nodes.replayer import Replayer, open_log
@@ -90,13 +89,6 @@ class OwnReplay(InThisProcess):
     def of(self, topic):
         return [data for name, data in self.heard if name == topic]
 
-    def pause(self, on):
-        (service,) = (one for one in self.node.services if one.srv_name.endswith('set_pause'))
-        service.callback(SetBool.Request(data=on), SetBool.Response())
-
-    def spin_until(self, what, condition):
-        wait_for(what, lambda: rclpy.spin_once(self.node, timeout_sec=0.1) or condition())
-
 
 def play_all(file, *options):
     """Play a log to its end; return what was sent by channel, and the exit code."""
@@ -151,7 +143,7 @@ def test_messages_keep_their_deadlines_late_ones_follow_at_once_and_a_pause_catc
             n * (cost + replayer.SHORTEST_WAIT_NS) for n in range(4)]
     begin, most = 1_000_000, replayer.SHORTEST_WAIT_NS
     with OwnReplay(path, '--start-paused') as replay:
-        pause, resume = (partial(replay.pause, on) for on in (True, False))
+        pause, resume = (partial(replay.switch, 'set_pause', on) for on in (True, False))
         times = schedule(replay, monkeypatch, plan={
             begin: resume, begin + 1_500_000: pause, begin + 9_500_000: resume})
     for at, due in zip(times, (0, 1_000_000, 10_000_000, 11_000_000), strict=True):

@@ -30,6 +30,23 @@ class InThisProcess:
         self.node.destroy_node()
         rclpy.try_shutdown()
 
+    def switch(self, name, on):
+        return self._serve(SetBool, name, data=on)
+
+    def trigger(self, name):
+        return self._serve(Trigger, name)
+
+    def _serve(self, kind, name, **request):
+        (service,) = (one for one in self.node.services if one.srv_name.endswith(f'/{name}'))
+        answer = service.callback(kind.Request(**request), kind.Response())
+        if isinstance(answer, Future):
+            self.spin_until('an answer', answer.done)
+            return answer.result()
+        return answer
+
+    def spin_until(self, what, condition):
+        wait_for(what, lambda: condition() or rclpy.spin_once(self.node, timeout_sec=0.1))
+
 
 class OwnNode(InThisProcess):
     """
@@ -78,23 +95,6 @@ class OwnNode(InThisProcess):
 
     def command(self, *data):
         self.receive('commands', Float64MultiArray(data=[float(one) for one in data]))
-
-    def switch(self, name, on):
-        return self._serve(SetBool, name, data=on)
-
-    def trigger(self, name):
-        return self._serve(Trigger, name)
-
-    def _serve(self, kind, name, **request):
-        (service,) = (one for one in self.node.services if one.srv_name.endswith(f'/{name}'))
-        answer = service.callback(kind.Request(**request), kind.Response())
-        if isinstance(answer, Future):
-            self.spin_until('an answer', answer.done)
-            return answer.result()
-        return answer
-
-    def spin_until(self, what, condition):
-        wait_for(what, lambda: condition() or rclpy.spin_once(self.node, timeout_sec=0.1))
 
     def step(self, count):
         """Step a paused motion, by 10 ms each; the samples are sent afterwards."""
