@@ -22,7 +22,6 @@ from spinning_top_sim import nodes
 from spinning_top_sim.nodes import replay_node, sim_node
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import scene_file, simulate
-from spinning_top_sim.tools.scene_file import read_scene
 
 packages = pytest.importorskip('ament_index_python.packages')
 pytest.importorskip('xacro')
@@ -106,7 +105,7 @@ def test_two_namespaces_share_no_frame_but_the_world():
 def test_what_is_set_replaces_what_files_say(tmp_path):
     run = started('sim', scene='looping')
     assert parameters_of(run['sim_node']) == parameters.checked(
-        read_scene(ROOT / 'config/looping.yaml'))
+        scene_file.read_scene(ROOT / 'config/looping.yaml'))
     assert set(run) == {'sim_node', 'robot_state_publisher'} and (
         ROOT / 'scripts/sim_node').exists()
     more = tmp_path / 'more.yaml'

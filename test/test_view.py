@@ -2,7 +2,6 @@
 """What the page draws, as numbers, and what its controls do; no browser, no ROS."""
 
 import math
-import os
 import subprocess
 import sys
 import threading
@@ -328,7 +327,7 @@ for name in ('rclpy', 'ament_index_python', 'rosbags', 'geometry_msgs', 'std_msg
     sys.modules[name] = None        # importing it raises an error
 from spinning_top_sim.__main__ import main
 sys.exit(main(['view', '--scene', 'wavy', '--html', {str(path)!r}, '-p', 'duration:=0.5']))
-"""], capture_output=True, text=True, timeout=120, env=os.environ, check=False)
+"""], capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, '')
     assert done.stdout.startswith(f'{path}: 0.5 s, ')
     page = path.read_text()
