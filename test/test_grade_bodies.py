@@ -77,6 +77,7 @@ def test_a_lag_that_the_motion_does_not_tell_is_not_told():
     parts = told(body(8, noisy=False, seconds=6.0, kind='free'), 'late')
     report = grade_readings({name: parts[name] for name in ('attitudes', 'gyroscope')})
     assert report.passed and 'or the readings are 1 +- ' in str(report.unjudged), report
+    assert 'this motion does not tell' in str(report.unjudged), report
 
 
 def test_another_axis_of_the_sensor_is_no_convention_and_rounded_stamps_are_no_fault():
