@@ -169,7 +169,7 @@ def test_without_positions_the_acceleration_of_the_origin_is_no_fault():
 
 
 def test_a_magnetometer_needs_no_field_and_its_faults_are_told():
-    moving = body(2, noisy=False, seconds=5.0, kind='forced', rate=200.0)
+    moving = body(2, noisy=False, seconds=3.0, kind='forced', rate=100.0)
     field = moving.rotation.inv().apply((0.0, 20e-6, -43e-6))
     parts = {**told(moving), 'magnetometer': (moving.t, field)}
     report = grade_readings(parts)
