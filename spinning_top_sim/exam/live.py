@@ -83,7 +83,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._subscription: Any = None
         self._process: Any = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
-        self._first = 0                             # the sample that a new node answers first
+        self._first = self._used = 0                # samples of a new node until it answers
         self.covariance: Reals | None = None
 
     def __exit__(self, *exception: object) -> None:
@@ -122,9 +122,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         for publisher in self._node.get_publishers_info_by_topic(self._topic):
             if publisher.topic_type != IMU:
                 raise NodeError(f'{self._topic} is {publisher.topic_type}: must be {IMU}')
-        self._now_ns, self._answered = START_NS, 0
+        self._now_ns, self._answered, self.covariance = START_NS, 0, None
         self._answers.clear()
-        self.covariance = None
         return self
 
     def _check_alone(self) -> None:
@@ -154,22 +153,23 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         return np.array((q.x, q.y, q.z, q.w))
 
     def _begin(self, publish: Callable[[float], bool]) -> None:
-        """Publish the first readings, again and later, until there is an answer."""
-        # A node may have no step to take at first.  Or it has taken one and the answer is lost; so
-        # all starts must need as many samples, and one that needs more is repeated.
-        tries = round(PATIENCE_S / AGAIN_S)
+        """Publish the first readings until there is an answer: a node may need two for a step."""
+        # An answer may be lost or late: a start that does not use as many as the first goes again.
         for _ in range(5):
-            sent = next((k for k in range(1, tries + 1) if publish(
-                ANSWER_S if k == (self._first or 1) else AGAIN_S)), 0)
-            if not sent:
-                raise RuntimeError(f'it answers none of {tries} samples: an attitude must have '
-                                   'the stamp of its sample')
-            self._first = self._first or sent
-            if sent <= self._first:
+            sent, answer = 0, False
+            while sent < self._used or not answer:
+                if sent * AGAIN_S > PATIENCE_S:
+                    raise RuntimeError(f'none of {sent} samples has an answer with its stamp')
+                sent += 1
+                answer = publish(ANSWER_S if answer or sent == (self._first or 1) else AGAIN_S)
+            step_ns = (self._now_ns - START_NS) // sent
+            first = min(ns - START_NS for ns in self._answers if ns > START_NS) // step_ns
+            self._first, self._used = self._first or first, self._used or sent
+            if first < self._first or (first, sent) == (self._first, self._used):
                 break
             self.start()
-        if sent != self._first:
-            raise NodeError(f'starts answer sample {self._first} or {sent} first: {self._lost}')
+        if first != self._first:
+            raise NodeError(f'starts answer sample {self._first} or {first} first: {self._lost}')
 
     def _publish(self, readings: Sequence[Reals | None], dt: float, seconds: float) -> bool:
         """Publish the readings of the next step; return whether there is an answer in time."""
