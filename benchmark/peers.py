@@ -20,7 +20,6 @@ import numpy as np
 from cases import Case
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
 from spinning_top_sim.times import NANOSECONDS
 
@@ -109,13 +108,6 @@ class _Ours(Runner):
     def samples(self, ns):
         states = self._states(ns)
         return Samples(states.quaternion, states.angular_velocity, states.phi, states.psi)
-
-
-class _ExactGrid(Runner):
-    def attitudes(self, ns):
-        solution = ExactSolution(self.case.top, self.case.start)
-        return solution.states(int(ns[1]) * np.arange(len(ns)),
-                               NANOSECONDS).quaternion
 
 
 def attitudes_of_angles(theta, phi, psi) -> np.ndarray:
@@ -245,8 +237,7 @@ class _Heyoka(Runner):
 
 SCIPY = 1e-6, 1e-9, 1e-12
 PEERS = (
-    Peer('exact, any times', 'ours', partial(_Ours, method='exact'), (0.0,), unit=''),
-    Peer('exact, grid', 'ours', _ExactGrid, (0.0,), unit=''),
+    Peer('exact', 'ours', partial(_Ours, method='exact'), (0.0,), unit=''),
     *(Peer(f'rk45 {equations}', 'ours', partial(_Ours, method='rk45', equations=equations),
            (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)) for equations in ('transport', 'euler')),
     Peer('SciPy RK45', 'SciPy', partial(_SciPy, method='RK45'), (1e-3, 1e-6, 1e-9)),
