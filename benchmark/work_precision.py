@@ -159,7 +159,7 @@ def _section(case: Case, rows: list[Row]) -> str:
 COLOURS = {'ours': '#D55E00', 'SciPy': '#0072B2', 'heyoka': '#009E73'}
 STYLES = {peer: {'color': COLOURS[peer.family] if peer.settings[0] else 'black',
                  'marker': marker, 'label': peer.name}
-          for peer, marker in zip(PEERS, 'PXop^svD', strict=True)}
+          for peer, marker in zip(PEERS, 'Xop^svD', strict=True)}
 
 
 def draw(results: dict[Case, list[Row]]) -> None:
