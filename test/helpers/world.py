@@ -20,7 +20,7 @@ from spinning_top_sim.nodes.clock import SimulatedClock
 from spinning_top_sim.nodes.loop import Loop, LoopState
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.physics.top import State
-from spinning_top_sim.recording import recorder
+from spinning_top_sim.recording import recorder, writer
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.live import LiveSimulation, Output
 from spinning_top_sim.streams.topics import resolve_topic
@@ -226,7 +226,8 @@ class World:
 
     def run(self):
         """Run the plan."""
-        with (self.disk, mock.patch.multiple(
+        chunk = mock.patch.object(writer, 'CHUNK_BYTES', 10 ** (3 + self.plan.seed % 3))
+        with (chunk, self.disk, mock.patch.multiple(
                 recorder, atexit=NO_EXIT, QUEUE_BYTES=QUEUE_BYTES, Recorder=Log)):
             self.machine.run(self._live)
         for one in (*self.readers, *self.logs):
