@@ -109,8 +109,7 @@ def test_a_pause_holds_a_step_is_exact_and_nothing_is_caught_up(monkeypatch):
     run.step_ns, before = 0, run.simulation.now_ns
     run.loop.resume()
     run.loop.resume()
-    run.ticks(3)
-    assert run.simulation.now_ns == before + 50 * 3 * TICK_NS
+    assert run.ticks(3).simulation.now_ns == before + 50 * 3 * TICK_NS
     assert run.times == grid(run.simulation.now_ns)
     assert run.loop.late_ticks == run.loop.skipped_ticks == 0
 
@@ -137,33 +136,31 @@ def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahe
     run.tick(900_000_000)
     assert run.simulation.now_ns < scale * 900_000_000
     run.step_ns = 0
-    run.ticks(10)
-    assert run.simulation.now_ns > scale * 900_000_000 and run.loop.slipped_ns == 0
+    assert run.ticks(10).simulation.now_ns > scale * 900_000_000 and run.loop.slipped_ns == 0
     run.room, stands_at = False, run.simulation.now_ns
     run.tick(900_000_000)
     run.tick(200_000_000)
     assert (run.simulation.now_ns, run.loop.slipped_ns) == (stands_at, scale * 1_100_000_000)
     run.room = True
-    run.ticks(4)
-    assert run.simulation.now_ns == stands_at + scale * 4 * TICK_NS
+    assert run.ticks(4).simulation.now_ns == stands_at + scale * 4 * TICK_NS
     assert run.times == grid(run.simulation.now_ns, SECOND // 1000)
 
 
 def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():
     run = Run().ticks(6)
+    with pytest.raises(ValueError, match=r'1e\+20'):        # and nothing changes
+        run.loop.reset({**run.values, 'spin.l3': 1e20}, paused=True)
     assert run.simulation.epoch_ns == DATE_NS
     run.loop.reset(run.values)
     assert run.simulation.epoch_ns == DATE_NS + 40_000_000      # behind the sample at 30 ms
-    run.ticks(2)
-    assert run.simulation.now_ns == 0, 'its date comes first'
-    run.ticks(2)
-    assert run.simulation.now_ns == 2 * TICK_NS and run.times == grid(2 * TICK_NS)
+    assert run.ticks(2).simulation.now_ns == 0, 'its date comes first'
+    assert run.ticks(2).simulation.now_ns == 2 * TICK_NS and run.times == grid(2 * TICK_NS)
     run.loop.pause()
     run.loop.reset(run.values)
-    run.ticks(30)
+    counted = run.ticks(30).counted
     assert (run.simulation.now_ns, run.times, run.kinds) == (0, [], ['reset', 'reset'])
     run.command(2.0)
-    assert run.counted > 0 and run.times == [0], 'a change sends the first sample to those there'
+    assert run.counted > counted and run.times == [0], 'a change sends it to those there'
     run.loop.reset(run.values, paused=False)
     assert run.ticks(4).loop.state is LoopState.RUNNING
 
@@ -179,8 +176,7 @@ FAILING = {
 
 @pytest.mark.parametrize('reason', FAILING)
 def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
-    run = Run(**FAILING[reason])
-    run.ticks(400)
+    run = Run(**FAILING[reason]).ticks(400)
     stands_at = run.simulation.now_ns
     assert reason in run.loop.failure and run.loop.state is LoopState.FAILED
     assert run.times == grid(stands_at)
