@@ -42,6 +42,7 @@ def as_parameters(node, l3, lz):
 def test_a_command_sets_the_momenta(node, command, l3, lz):
     assert node.set(pose__rate=50.0).successful and node.switch('record', True).success
     node.step(50)
+    assert node.set(pose__rate=25.0, seed=7).successful, 'the one now, the other later'
     command(node, l3, lz)
     assert node.get('spin.l3', 'spin.lz') == [l3, lz]
     node.step(50)
@@ -131,15 +132,15 @@ def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
 
 def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node):
     output = next(one for one in node.simulation.outputs if one.channel.topic == 'pose')
-    assert node.set(pose__enabled=False).successful
+    node.listen('pose').step(5)
+    assert output.is_used and output.sent == 6, 'with that of t = 0'
+    assert node.set(pose__enabled=False).successful and output.publish is None
     assert not [one for one in node.node.publishers if one.topic_name == '/pose']
     assert node.set(pose__enabled=True).successful
     node.step(5)
-    assert not output.is_used and output.sent == 0
+    assert not output.is_used and output.sent == 6
     node.listen('pose').step(5)
-    assert output.is_used and output.sent > 0
-    assert node.set(pose__enabled=False).successful
-    assert output.publish is None
+    assert output.is_used and output.sent == 11
 
 
 def test_parameters_are_described(node):
