@@ -213,10 +213,11 @@ def test_a_trace_stays_where_the_tip_was_and_breaks_where_it_jumps():
 
 def test_a_log_is_shown_up_to_a_reset_to_another_top(tmp_path):
     own_node = pytest.importorskip('helpers.own_node')
-    with own_node.OwnNode(tmp_path, start_paused=True, record__enabled=True,
+    with own_node.OwnNode(tmp_path, start_paused=True,
                           record__streams=['ground_truth_imu']) as node:
+        assert node.set(top__mass=0.3).successful and node.switch('record', True).success
         node.step(50)
-        assert node.set(top__mass=0.3).successful and node.trigger('reset').success
+        assert node.trigger('reset').success
         node.step(50)
     source = LogSource(tmp_path / 'run.mcap', Desk)
     assert source.page.message.content == '*run.mcap is shown up to the reset to another top*'
