@@ -78,11 +78,11 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
 
 @pytest.fixture
 def limited():
-    """Let this process die if it takes a gigabyte more, or two minutes."""
+    """Let this process die if it takes a gigabyte more, or ten minutes."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     mapped = resource.getpagesize() * int(Path('/proc/self/statm').read_text().split()[0])
     resource.setrlimit(resource.RLIMIT_AS, (mapped + 10 ** 9, before[1]))
-    faulthandler.dump_traceback_later(120.0, exit=True)
+    faulthandler.dump_traceback_later(600.0, exit=True)    # whatever else runs
     yield
     faulthandler.cancel_dump_traceback_later()
     resource.setrlimit(resource.RLIMIT_AS, before)
