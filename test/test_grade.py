@@ -61,6 +61,15 @@ def test_a_defect_of_the_readings_is_named(name):
         assert report.found[0].number == pytest.approx(NUMBERS[name], rel=0.05)
 
 
+@pytest.mark.parametrize(('name', 'body', 'scenes'), [
+    ('wrong dt', WHEEL, SCENES[1:4]), ('residuals', SENSOR, SCENES[1:3])])
+def test_what_else_a_defect_looks_like_is_not_told(name, body, scenes):
+    """Another place of the IMU; noise by chance."""
+    report = grade(Imu(defect=name, seed=1), body=body, dt=0.001, scenes=[
+        replace(scene, duration=0.4 * scene.duration) for scene in scenes])
+    assert report.faults == [DEFECTS[name][0]], report
+
+
 @pytest.mark.parametrize('name', MOVED)
 def test_a_defect_of_the_motion_is_named(name):
     simulator, faults = MOVED[name]

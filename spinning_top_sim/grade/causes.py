@@ -191,6 +191,9 @@ class Causes:
     def _arm(self, found: Reals) -> Finding | None:
         """Judge where the IMU is."""
         arm, point = self.compared.arm, found[-3:] + self.compared.arm
+        share = float(point @ arm) / (float(arm @ arm) or 1.0)
+        if share > NEAR and np.linalg.norm(point - share * arm) < LIKE * np.linalg.norm(point):
+            return self._term('lever', np.array([share - 1.0]))
         return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
                        f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
 
@@ -277,9 +280,9 @@ def _noise_faults(compared: Comparison, model: Model, rest: Fit,
     # Without noise of poses, all that is left is that of readings, or a fast motion.
     noise = compared.reading_noise if compared.noisy else min(
         compared.reading_noise, rest.rest / (math.sqrt(3.0) * model.size(OFFSETS[0])))
+    exists = noise > ROUNDING * float(np.min(compared.sizes))
     declared = math.nan if density is None else density / math.sqrt(compared.own_step)
-    band = NOISE_BAND + OF_CHANCE / math.sqrt(model.count)
-    if abs(noise - declared) > band * declared + ROUNDING * float(np.min(compared.sizes)):
-        ratio = noise / declared if declared else math.inf
+    ratio = noise / declared if declared else math.inf if exists else 1.0
+    if abs(ratio - 1.0) > NOISE_BAND + OF_CHANCE / math.sqrt(model.count):
         yield Finding('noise_scale', f'the noise has a standard deviation of {noise:.4g}, '
                       f'{ratio:.4g} times what is declared, {declared:.4g}', ratio)

@@ -96,7 +96,8 @@ class Comparison:
                      if kind in one.readings and len(one.t) >= 4 * kinematics.margin(1)]
         of_field = rms(self.field) * (kind == 'magnetometer')       # readings may be zeros
         sizes = [max(rms(one.readings[kind]), of_field) for one in stretches]
-        self.sizes = np.maximum(sizes, 0.1 * max(sizes, default=0.0) or 1.0)    # it may rest
+        least = 0.1 if kind in OF_TURNS else 0.01       # at rest there are no rates, but gravity
+        self.sizes = np.maximum(sizes, least * max(sizes, default=0.0) or 1.0)
         self.reading_noise = rms(np.array([one.sigma.get(kind, 0.0) for one in stretches] or [0]))
         # The interval of the sensor [s], and its samples per sample that is compared.
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
@@ -187,7 +188,8 @@ class Comparison:
             for motion, parts in zip(pair, (plain, noisy), strict=True):
                 effects = self.columns(motion)
                 read = self.read(motion, lag)
-                effects |= {TARGET: read - effects['total'], 'step': np.gradient(read, axis=0)}
+                effects |= {TARGET: read - effects['total'], 'step': np.gradient(
+                    read if self.noisy else effects.get('whole', read), axis=0)}
                 parts.append({name: one[keep][smooth] / size for name, one in effects.items()})
         return Model(plain, noisy, self.always)
 
@@ -199,7 +201,7 @@ class Comparison:
             effects = {f'field {k}': motion.back @ axis for k, axis in enumerate(AXES)}
             effects['total'] = motion.back @ self.field
         else:
-            effects = dict.fromkeys(('rates', 'total'), motion.rates)
+            effects = dict.fromkeys(('rates', 'total', 'whole'), motion.rates)
         total = effects['total']
 
         def turned(reading: Reals) -> Reals:
@@ -222,7 +224,7 @@ class Comparison:
         gravity, moved = self.gravity * motion.back @ UP, motion.acceleration + second @ self.arm
         return {
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
-            'linear': motion.acceleration, 'lever': second @ self.arm,
+            'linear': motion.acceleration, 'lever': second @ self.arm, 'whole': gravity + moved,
             'total': gravity + (motion.acceleration if self.always else moved),
             'fixed gravity': self.gravity * (0.0 * gravity + self.mounting.apply(UP)),
             # The motion a step later, then the axes.
