@@ -23,7 +23,7 @@ live = importlib.import_module('spinning_top_sim.exam.live')
 NODE = f'{sys.executable} {ROOT / "examples/attitude_node.py"}'
 # A node that answers each sample with the parity of its number, once it has a reader.
 PLAIN = """
-import sys, time, rclpy
+import itertools, time, rclpy
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu, Temperature
 with open(__file__ + '.starts', 'a') as starts:
@@ -33,10 +33,9 @@ rclpy.init()
 node = rclpy.create_node('plain')
 publisher = node.create_publisher(Imu, 'imu/data', PROFILE)
 node.create_publisher(Temperature, 'imu/temperature', 1)
-count = 0
+numbers = itertools.count(1)
 def take(message):
-    global count
-    count += 1
+    count = next(numbers)
     message.orientation.x, message.orientation.w = count % 2.0, 1.0 - count % 2.0
     while not publisher.get_subscription_count():
         time.sleep(0.01)
@@ -72,11 +71,10 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
 
 
 def test_a_lost_message_is_no_fault_of_a_best_effort_node(run, plain, monkeypatch):
-    # The first answer of the second start is lost: the node has used the sample, so starts anew.
+    # The first answer of a start is lost: the node has used the sample, so starts anew, if it can.
     with live.NodeExam(plain((2, 1), profile='10'), 'imu/data') as node:
         one, same = feeding.feed(node.start, [run, run])
         assert np.array_equal(one.estimates, same.estimates)
-    # That of the first one: no verdict.
     with (live.NodeExam(plain((1, 1), profile='10'), 'imu/data') as node,
           pytest.raises(feeding.NodeError, match='starts answer sample 2 or 1 first: a mess')):
         feeding.feed(node.start, [run, run])

@@ -88,7 +88,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
 def cost(found: Sequence[Finding]) -> int:
     """Return how unlikely faults are: the more, the less explained, the more free numbers."""
     free = 'bias', 'gravity', 'mounting', 'rates_scale', 'reading_scale', *TERMS.values()
-    return sum(18 if one.name == 'inaccurate' else 2 + (one.name in free) for one in found)
+    return sum(6 if one.name == 'inaccurate' else 2 + (one.name in free) for one in found)
 
 
 def _explained(compared: Comparison, lag: int) -> tuple[Model, list[Finding], Fit]:
@@ -150,7 +150,8 @@ class Causes:
         for name in TERMS if self.kind == 'accelerations' else ():
             if not self.arms or name in ('gravity', 'linear'):
                 yield Cause([name], partial(self._term, name))
-        yield Cause(['total'], lambda found: self._matrix((1.0 + found[-1]) * AXES))
+        if not self.compared.told:      # a unit that is exchanged is a scale
+            yield Cause(['total'], lambda found: self._matrix((1.0 + found[-1]) * AXES))
         yield Cause(['step'])
         if self.kind == 'accelerations':
             yield Cause(['difference'], lambda found: Finding(
