@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files: `simulate` finds in them what rclpy finds for `sim_node`."""
 
-import contextlib
 import json
 
 import pytest
@@ -20,25 +19,29 @@ VALUES = ['1e-9', '1e5', '-1E+5', '1.5', '.5', '5.', '+5', '-3', '010', '08', '0
           '[1, 2, 3]', '[1.0, 2e3]', '[a, b]', '["1", a]', '[true, false]']
 
 
-@contextlib.contextmanager
-def ros_node(path, name='/spinning_top'):
-    """Yield a node of this full name that was started with a parameter file."""
+@pytest.fixture(scope='module')
+def ros_parameters():
+    """Return what returns the parameters of a node that is started with a parameter file."""
     pytest.importorskip('rclpy')
     import helpers.node_harness  # noqa: F401 - DDS stays on this machine
     import rclpy
     from rclpy.context import Context
     from rclpy.node import Node
 
-    context = Context()
-    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
-    try:
+    def ros_parameters(path, name='/spinning_top'):
         namespace, _, name = name.rpartition('/')
-        node = Node(name, context=context, namespace=namespace, start_parameter_services=False,
+        node = Node(name, context=context, namespace=namespace, use_global_arguments=False,
+                    cli_args=['--ros-args', '--params-file', str(path)],
+                    enable_rosout=False, start_parameter_services=False,
                     automatically_declare_parameters_from_overrides=True)
-        yield node
+        found = {name: one.value for name, one in node.get_parameters_by_prefix('').items()}
         node.destroy_node()
-    finally:
-        rclpy.shutdown(context=context)
+        return found
+
+    context = Context()
+    rclpy.init(args=[], context=context)
+    yield ros_parameters
+    rclpy.shutdown(context=context)
 
 
 def scene(path, **values):
@@ -47,13 +50,11 @@ def scene(path, **values):
     return path
 
 
-def test_values_have_the_types_that_rcl_finds(tmp_path):
+def test_values_have_the_types_that_rcl_finds(ros_parameters, tmp_path):
     path = scene(tmp_path / 'p.yaml', **{f'p{k}': text for k, text in enumerate(VALUES)})
-    with ros_node(path) as node:
-        theirs = [node.get_parameter(f'p{k}').value for k in range(len(VALUES))]
-    ours = [parse_yaml(text, text) for text in VALUES]
-    assert list(zip(VALUES, map(repr, ours), strict=True)) == list(
-        zip(VALUES, map(repr, theirs), strict=True))
+    theirs = ros_parameters(path)
+    for k, text in enumerate(VALUES):
+        assert repr(parse_yaml(text, text)) == repr(theirs[f'p{k}']), text
 
 
 def test_a_number_in_quotes_is_a_number_where_a_double_is_wanted(tmp_path):
@@ -74,16 +75,14 @@ SECTIONS = [
 
 @pytest.mark.parametrize('node', ['/spinning_top', '/left/spinning_top', '/a/b/spinning_top',
                                   '/left/other'])
-def test_a_section_applies_to_the_nodes_that_rcl_applies_it_to(tmp_path, node):
+def test_a_section_applies_to_the_nodes_that_rcl_applies_it_to(ros_parameters, tmp_path, node):
     path = tmp_path / 'p.yaml'
     for section in SECTIONS:
         content = {'ros__parameters': {'world_frame': 'map'}}
         for key in reversed([section] if isinstance(section, str) else section):
             content = {key: content}
         path.write_text(yaml.dump(content))
-        with ros_node(path, node) as ros:
-            theirs = ros.get_parameters_by_prefix('').get('world_frame')
-        if theirs is None:
+        if 'world_frame' not in ros_parameters(path, node):
             with pytest.raises(ValueError, match=f'no parameters for the node {node}: '):
                 read_scene(path, node)
         else:
@@ -101,12 +100,12 @@ def test_a_namespace_is_the_prefix_of_frames_but_the_world_and_of_nothing_else(t
     assert [values[name] for name in parameters.FRAMES] == ['world', 'left/base_link', 'left/chip']
 
 
-def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(tmp_path):
+def test_a_file_that_names_the_node_applies_in_any_namespace(ros_parameters, tmp_path):
     path = tmp_path / 'p.yaml'
     path.write_text(''.join(f'{name}: {{ros__parameters: {{world_frame: f{k}}}}}\n'
                             for k, name in enumerate(['/**', '/**/spinning_top', '/*', 'other'])))
-    with ros_node(path) as node:        # the last section of the node decides
-        assert read_scene(path) == {'world_frame': node.get_parameter('world_frame').value}
+    # The last section of the node decides.
+    assert read_scene(path) == {'world_frame': ros_parameters(path)['world_frame']}
     path.write_text('spinning_top:\n  ros__parameters:\n    top.mass: 5\n')
     for node in ('/spinning_top', '/left/spinning_top', '/left/another_name'):
         assert read_scene(path, node) == {'top.mass': 5.0}
