@@ -6,8 +6,10 @@ Numbers are read back to the last bit.
 """
 
 import csv
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
@@ -95,6 +97,25 @@ def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
         raise ValueError(f'columns have {sorted(lengths)} rows: must have as many')
     return dict(zip(names, columns, strict=True)), rows or [
         f'row {k}' for k in range(max(lengths, default=0))]
+
+
+def numbers(columns: Columns, name: str, rows: Sequence[str], *, exact: bool) -> NDArray[Any]:
+    """
+    Return a column (n,) as float, NaN where a cell is empty, or exactly, as Decimal.
+
+    Raises ValueError, by what its row is called: a cell is no number, or, if `exact`, empty.
+    """
+    found = list[Any]()
+    for row, cell in zip(rows, columns[name], strict=True):
+        text = '' if cell is None else str(cell).strip()
+        try:
+            number = Decimal(text) if exact else float(text or 'nan')
+        except (ArithmeticError, ValueError):
+            number = math.inf
+        if '_' in text or math.isinf(number) or (math.isnan(number) and exact):
+            raise ValueError(f'{row}: {name} = {text[:40]!r}: must be a number such as -12.5')
+        found.append(number)
+    return np.array(found)
 
 
 def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:

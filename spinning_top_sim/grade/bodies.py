@@ -115,20 +115,14 @@ def undone(body: Stretch, convention: Convention) -> Stretch:
                    positions=Rotation.from_quat(convention.world).inv().apply(body.positions))
 
 
-def _of_sensor(one: Convention) -> bool:
-    """Return whether a convention has other axes of the sensor, or the world turned about z."""
-    turn = Rotation.from_quat(one.world)
-    return any(part.startswith('sensor') for part in one.parts) or bool(
-        turn.magnitude() > 0.1 and turn.apply(UP)[2] > 0.9 and not one.conjugate)
-
-
 def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Convention:
     """
     Return how attitudes are told: ours, unless another explains readings that ours does not.
 
-    Axes of the sensor are left to the readings, and a z that is down to the sign of gravity.
+    Axes of the sensor, and turns about z, are left to readings, a z that is down to gravity.
     """
-    ours, *others = (one for one in conventions.group() if not _of_sensor(one))
+    group = [one for one in conventions.group() if 'sensor' not in one.name and (
+        one.conjugate or one.world[3] > 0.9 or Rotation.from_quat(one.world).apply(UP)[2] < 0.9)]
     body = max(bodies, key=lambda one: len(one.t))
     first = max(len(body.t) - EXCERPT, 0) // 2          # it may rest at first, and at last
     body = body.part(slice(first, first + EXCERPT))
@@ -151,7 +145,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
                 break
         return worst
 
-    after = [left(one) for one in others]
+    after = [left(one) for one in group]
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(np.array(after) <= conventions.AS_GOOD * min(after) + 1e-6))
-    return others[best] if after[best] < SMALL else ours
+    return group[best * (after[best] < SMALL)]

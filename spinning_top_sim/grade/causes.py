@@ -233,7 +233,7 @@ class Causes:
         turn = Rotation.from_matrix(matrix)
         angle, near = float(turn.magnitude()), max(REAL, OF_TURN * change)
         return Finding('mounting', 'the axes of the readings are turned by '
-                       f'({listed(turn.inv().as_rotvec())}) rad', angle) if (
+                       f'({listed(turn.inv().as_rotvec())}) rad from the mounting', angle) if (
             angle > self.strange and np.max(np.abs(matrix - turn.as_matrix())) < near) else None
 
 

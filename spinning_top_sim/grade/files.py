@@ -21,7 +21,7 @@ import numpy as np
 
 from spinning_top_sim.grade.columns import READINGS
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.table import Columns, read_columns
+from spinning_top_sim.table import Columns, numbers, read_columns
 from spinning_top_sim.times import NEVER_NS, stamp_text
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.cli import one_line
@@ -46,7 +46,6 @@ OF_TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
 TUM = ['timestamp', 'tx', 'ty', 'tz', *OF_TUM[4:]], [f'column {k}' for k in range(1, 9)]
 EUROC = {'timestamp': 't [ns]', **{f'{theirs}_{axis}': f'{ours}{axis}' for theirs, ours in (
     ('p_RS_R', 'p'), ('q_RS', 'q'), ('w_RS_S', 'g'), ('a_RS_S', 'a')) for axis in 'wxyz'}}
-OF_IMU = re.compile(r'^/.*:|/sensor.yaml$')     # transforms to other frames
 OF_EUROC = 'state_groundtruth_estimate0/data.csv', 'imu0/data.csv'
 # Topics of this package that are graded where its log has them, the first of each kind.
 OURS = 'pose', 'ground_truth/odom', 'ground_truth/imu', 'imu/data_raw', 'imu/data', 'imu/mag'
@@ -147,8 +146,6 @@ def read(path: Path, columns: str | None = None, topics: Sequence[str] = ()) -> 
                 table = dict(zip(OF_TUM, table.values(), strict=True))
             unused = _add(recorded, table, rows, columns_said(columns or ''))
         recorded.notes += [f'not used: {", ".join(unused)}'] * bool(unused)
-        if not recorded.run and any(map(OF_IMU.search, unused)):
-            recorded.notes.append('only --lever-arm and -p imu.rpy say where the IMU is')
         recorded.check()
     except (ValueError, EOFError, csv.Error, BadZipFile) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error
@@ -240,26 +237,11 @@ def _add(recorded: Recorded, columns: Columns, rows: Sequence[str], said: Chosen
     for kind, (names, units) in PARTS.items():
         pairs = [pair for name in names for pair in chosen.get(name, ())]
         source = ', '.join(f'{column} [{unit}]' for column, unit in pairs).replace(' [1]', '')
-        numbers = [units[unit] * _numbers(rows, column, columns[column], unit)
-                   for column, unit in pairs]
+        values = [units[unit] * numbers(columns, column, rows, exact=kind == 't')
+                  for column, unit in pairs]
         if kind == 't':
-            stamps = sum(numbers)
+            stamps = sum(values)
             recorded.notes.append(f'times of column {source}')
-        elif numbers:
-            recorded.add(kind, source, stamps, np.stack(numbers, axis=1), rows)
+        elif values:
+            recorded.add(kind, source, stamps, np.stack(values, axis=1), rows)
     return [column for column in columns if column not in used]
-
-
-def _numbers(rows: Sequence[str], column: str, cells: Sequence[Any], unit: str) -> Any:
-    """Return a column (n,), times exactly, where a cell is empty NaN.  Raises ValueError."""
-    found, is_time = [], unit in UNITS['t']
-    for row, cell in zip(rows, cells, strict=True):
-        text = '' if cell is None else str(cell).strip()
-        try:
-            number = Decimal(text) if is_time else float(text or 'nan')
-        except (ArithmeticError, ValueError):
-            number = math.inf
-        if '_' in text or math.isinf(number) or (math.isnan(number) and is_time):
-            raise ValueError(f'{row}: {column} = {text[:40]!r}: must be a number such as -12.5')
-        found.append(number)
-    return np.array(found)

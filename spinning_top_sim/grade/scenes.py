@@ -10,7 +10,7 @@ import numpy as np
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade.columns import STANDARD_GRAVITY, Imu
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import ContinuedState, State, Top
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class Body(Imu, Top):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start(State):
+class Start(ContinuedState):
     """
     A state with what engines need.
 
@@ -55,9 +55,6 @@ class Start(State):
 
     attitude: tuple[float, float, float, float]
     rates: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        """Accept what is made of a state."""
 
     @classmethod
     def of(cls, top: Top, state: State) -> Self:

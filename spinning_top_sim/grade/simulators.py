@@ -141,7 +141,8 @@ class Judgement:
         if not self.motions:
             return
         error, name, slow = self.worst
-        wrong, of_rates = error > self.limit, self._readings('rates')
+        wrong = error > self.limit
+        of_rates = judge('rates', self.motions, self.body, self.body.gravity)
         scaled = wrong and [one.name for one in of_rates.found] == ['rates_scale']
         if scaled or not (of_rates.found or of_rates.unjudged):     # what is told is known
             self.motions = [replace(motion, rates=motion.readings.get('rates'))
@@ -151,10 +152,7 @@ class Judgement:
         text = f'{name}: the attitude is up to {error:.3g} deg off'
         yield Report('', [one._replace(evidence=f'{text}; {one.evidence}') for one in found] or [
             Finding('inaccurate', text, error)] * (wrong and not scaled), self.marks)
-        yield from map(self._readings, READINGS)
-
-    def _readings(self, kind: str) -> Report:
-        return judge(kind, self.motions, self.body, self.body.gravity)
+        yield from (judge(kind, self.motions, self.body, self.body.gravity) for kind in READINGS)
 
 
 def _equations(body: Body, motions: Sequence[Stretch]) -> list[Finding]:
