@@ -40,8 +40,8 @@ PIP = $(BIN)/python' -m pip --disable-pip-version-check install $(if $(MAKE_TERM
 # Each worker would import the other plug-ins, and rewrite their assertions, in two seconds.
 test coverage: export PYTEST_DISABLE_PLUGIN_AUTOLOAD := 1
 # The workers are enough threads: more of them wait for each other, a sixth of the time.
-test coverage: export OMP_NUM_THREADS := 1
-test coverage: export OPENBLAS_NUM_THREADS := 1
+test coverage stress: export OMP_NUM_THREADS := 1
+test coverage stress: export OPENBLAS_NUM_THREADS := 1
 PYTEST = $(BIN)/pytest' -p xdist -n $(WORKERS) --max-worker-restart=0
 # The package and the wheels of ROS.
 WITH_ROS := $(VENV)/.deps-ros-$(ROS) $(VENV)/.package

@@ -126,7 +126,7 @@ def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:
         raise ValueError('it is no text in UTF-8: convert it, as by iconv or gunzip') from error
     bare = ['' if line[:1] == '#' else line for line in lines]
     first = next(filter(str.strip, bare), '')
-    mark = next((mark for mark in ',;\t' if mark in first), ' ')
+    mark = next((mark for mark in ',;\t|' if mark in first), ' ')
 
     def cells(lines: Sequence[str]) -> list[list[str]]:
         return [[*map(str.strip, row)]

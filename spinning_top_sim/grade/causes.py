@@ -51,10 +51,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     if found or rest.beyond > STRANGE:
         other = compared.exchanged(shift)
         another, others, left = _explained(other, shift)
-        # Noise may be exchanged for more noise.
-        known = not compared.noisy or SURE * another.fit(['total']).sigma[-1] < TELLS
-        if known and (cost(others) < cost(found)
-                      or left.beyond + STRANGE < UNEXPLAINED * rest.beyond):
+        if ((cost(others) < cost(found) and left.beyond < rest.beyond + REAL)
+                or left.beyond + STRANGE < UNEXPLAINED * rest.beyond):
             compared, model, found, rest = other, another, others, left
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
@@ -68,8 +66,9 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     name = 'early' if late < 0.0 else 'late'
     text = (f'the readings are {abs(late):.3g} {_interval(sigma)} steps of '
             f'{1e3 * compared.own_step:.3g} ms {name}')
-    near = abs(late / compared.steps - shift) < 1.0     # else it is no lag that `step` tells
-    is_late = (near if shift else not found) and abs(late) > max(LATE + 1.96 * sigma, SURE * sigma)
+    near = abs(late / compared.steps - shift) < 1.5     # else it is no lag that `step` tells
+    is_late = abs(late) > max(LATE + 1.96 * sigma, SURE * sigma) and (
+        near if shift or (found and compared.noisy) else not found)     # noise hides it from `lag`
     if not is_late and not abs(late) + 1.96 * sigma <= LATE and (either or not found):
         or_else = found[0].evidence if found else 'there is no fault'
         unjudged, found = [f'{kind}: {or_else}, or {text}: this motion does not tell'
@@ -140,8 +139,11 @@ class Causes:
             sure = size > STRANGE and np.any((np.abs(bias.found) > SURE * bias.sigma)[-3:])
             return [*filter(None, [self._bias(bias.found) if sure else None])], right
         found, rest = identify.explain(self.model, [*self._causes()], 0.5 * STRANGE)
-        if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange,
-                             UNEXPLAINED * self.noisy + 2.0 * rest.noise):
+        # Several causes explain anything of which little shows.
+        vague = self.arms and not self.model.clear('total', SEEN)
+        if (vague and len(self.compared.told + found) > 1) or rest.beyond > max(
+                UNEXPLAINED * right.beyond, self.strange,
+                UNEXPLAINED * self.noisy + 2.0 * rest.noise):
             found = [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
                              'that of the motion', rest.beyond)]
         return found, rest

@@ -87,7 +87,6 @@ class Comparison:
         self.always = [f'{"field" if kind == "magnetometer" else "arm"} {k}'
                        for k in range(3)] if known is None else []
         self.arms = self.always if kind == 'accelerations' else []
-        # Effects of a matrix on all terms.
         self.matrix = [f'matrix {i}{j} {of}' for of in (*self.arms, 'total') for i, j in ENTRIES]
         self.exchange = AXES        # by which what is read is multiplied, and the fault of that
         self.told: list[Finding] = []
@@ -148,7 +147,7 @@ class Comparison:
         squares = np.mean(np.concatenate(residuals) ** 2, axis=0).reshape(-1, 3).mean(axis=1)
         best, least = int(np.argmin(squares)), (EXACT * rms(self.sizes)) ** 2
         # Of smoothed samples fewer are independent.
-        unlike = (2.0 * SURE) ** 2 * 2.0 * motions[0].width / (3 * sum(map(len, residuals)))
+        unlike = 2.0 * SURE ** 2 * motions[0].width / (3 * sum(map(len, residuals)))
         near = squares < squares[best] + unlike * max(squares[best], least)
         alone = np.max(np.abs(np.flatnonzero(near) - best)) <= 1 and 0 < best < len(lags) - 1
         return lags[best] if alone and squares[lags.index(0)] > least else 0
@@ -176,7 +175,8 @@ class Comparison:
         name = 'axes' if np.trace(np.abs(axes)) < 3.0 else (
             {3.0: 'units', -3.0: 'reading_sign'}.get(float(np.trace(axes)), 'sign'))
         other.told = [Finding(name, f'the readings are {1.0 / unit:.4g} times the right ones, '
-                              f'axes {conventions.axes(axes.T)}, in {called}', 1.0 / unit)]
+                              f'axes {conventions.axes(axes.T)}, in {called}', 1.0 / unit)] * bool(
+                                  np.any(other.exchange != AXES))
         return other
 
     def model(self, lag: int) -> Model:

@@ -138,8 +138,6 @@ class Judgement:
 
     def reports(self) -> Iterator[Report]:
         """Yield what is wrong with the motions and with each reading."""
-        if not self.motions:
-            return
         error, name, slow = self.worst
         wrong = error > self.limit
         of_rates = judge('rates', self.motions, self.body, self.body.gravity)
