@@ -119,7 +119,7 @@ def numbers(columns: Columns, name: str, rows: Sequence[str], *, exact: bool) ->
 
 
 def _text(path: Path) -> tuple[list[str], list[Any], list[str]]:
-    """Read columns between commas, semicolons, tabs or spaces; # begins a comment."""
+    """Read columns between commas, semicolons, tabs, bars or spaces; # begins a comment."""
     try:
         lines = [line.strip(' ') for line in path.read_text('utf-8-sig').splitlines()]
     except UnicodeDecodeError as error:

@@ -55,7 +55,7 @@ def test_the_table_is_read_in_any_format(tmp_path):
                                  for kind in told(BODY) for name in PARTS[kind][0]}}
     for path in (table(tmp_path / 'a.csv', columns), tmp_path / 'a.parquet', tmp_path / 'a.npz',
                  table(tmp_path / 'b.txt', columns, ' ', '# '), table(
-                     tmp_path / 'c.csv', columns, ';'), table(tmp_path / 'd.csv', brackets)):
+                     tmp_path / 'c.csv', columns, ';'), table(tmp_path / 'd.txt', brackets, '|')):
         same(read(path))
 
 
