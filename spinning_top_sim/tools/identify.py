@@ -155,9 +155,10 @@ def explain(model: Model, causes: Sequence[Cause],
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * fit.beyond, fit.noise or np.inf),
                    TINY * nothing.beyond)
         # Of equally good causes the one with the fewest effects wins, for more effects always fit
-        # better, then the one that is named first.
-        _, _, best = min((len(cause.effects), max(left, good / AS_GOOD), k) for k, (
-            cause, left) in enumerate(zip(others, after, strict=True)) if left <= good)
+        # better, then the one that leaves clearly least, then the one that is named first.
+        equal = [k for k, left in enumerate(after) if left <= good]
+        near = (1.0 + SURE ** 2 / model.count) * min(tried[k].rest for k in equal)
+        best = min(equal, key=lambda k: (len(others[k].effects), max(tried[k].rest, near)))
         if after[best] > WORTHWHILE * fit.beyond:
             break
         chosen.append(others.pop(best))

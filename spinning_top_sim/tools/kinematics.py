@@ -169,8 +169,7 @@ class Smoothed:
             self.smooth[:] = True
 
     def _convolved(self, values: Reals) -> Reals:
-        smooth: Reals = correlate1d(values, kernel(self.width), axis=0)
-        return smooth
+        return np.asarray(correlate1d(values, kernel(self.width), axis=0))
 
     def rate(self, values: Reals) -> Reals:
         """Return rates in the body (n, 3), smoothed as `rates` are (m, 3)."""
