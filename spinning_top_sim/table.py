@@ -23,7 +23,7 @@ from spinning_top_sim.installation import needed
 FilePath = str | Path
 Columns = Mapping[str, Sequence[Any]]           # numbers, or texts, by name
 NUMBER = re.compile(r'[-+]?[\d.]+([eE][-+]?\d+)?')
-NUMBERS = re.compile(rf'({NUMBER.pattern}[,;\s]+){{2}}')         # how a line of them begins
+NUMBERS = re.compile(rf'({NUMBER.pattern}[,;|\s]+){{2}}')         # how a line of them begins
 
 # Names and units of the columns of a table; the second one is for a pivot that moves.
 UNITS = {
@@ -99,7 +99,8 @@ def read_columns(path: Path) -> tuple[Columns, Sequence[str]]:
         f'row {k}' for k in range(max(lengths, default=0))]
 
 
-def numbers(columns: Columns, name: str, rows: Sequence[str], *, exact: bool) -> NDArray[Any]:
+def column_numbers(columns: Columns, name: str, rows: Sequence[str], *,
+                   exact: bool) -> NDArray[Any]:
     """
     Return a column (n,) as float, NaN where a cell is empty, or exactly, as Decimal.
 

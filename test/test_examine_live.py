@@ -71,7 +71,7 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
 
 
 def test_a_lost_answer_is_no_fault_of_the_node(run, plain, monkeypatch):
-    # The first of a start: the node has used the sample, so it starts anew, if that helps.
+    # The first after a start: the node has used the sample, so it starts anew, if that helps.
     with live.NodeExam(plain((2, 1), profile='10'), 'imu/data') as node:
         one, same = feeding.feed(node.start, [run, run])
         assert np.array_equal(one.estimates, same.estimates)

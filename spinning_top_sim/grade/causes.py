@@ -57,7 +57,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
     late, sigma, unjudged = math.nan, math.inf, [*_untold(compared, model)]
-    # If there is nothing else; if that does not tell, whatever matrix, bias and a x r there are.
+    # If there is nothing else; unless it is none, whatever matrix, bias and a x r there are.
     whatever = model.fit(['step', *MATRIX, *OFFSETS, *(k for k in model.names if 'turned' in k)])
     for fit in [alone] if either else [whatever] if found else [alone, whatever]:
         if not abs(late) + 1.96 * sigma <= LATE:
@@ -67,8 +67,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     text = (f'the readings are {abs(late):.3g} {_interval(sigma)} steps of '
             f'{1e3 * compared.own_step:.3g} ms {name}')
     near = abs(late / compared.steps - shift) < 1.5     # else it is no lag that `step` tells
-    is_late = abs(late) > max(LATE + 1.96 * sigma, SURE * sigma) and (
-        near if shift or (found and compared.noisy) else not found)     # noise hides it from `lag`
+    is_late = abs(late) > max(LATE + 1.96 * sigma, SURE * sigma) and (  # noise hides it from lag
+        near if shift or (found and compared.noisy and not either) else not found)
     if not is_late and not abs(late) + 1.96 * sigma <= LATE and (either or not found):
         or_else = found[0].evidence if found else 'there is no fault'
         unjudged, found = [f'{kind}: {or_else}, or {text}: this motion does not tell'
@@ -141,9 +141,9 @@ class Causes:
         found, rest = identify.explain(self.model, [*self._causes()], 0.5 * STRANGE)
         # Several causes explain anything of which little shows.
         vague = self.arms and not self.model.clear('total', SEEN)
-        if (vague and len(self.compared.told + found) > 1) or rest.beyond > max(
-                UNEXPLAINED * right.beyond, self.strange,
-                UNEXPLAINED * self.noisy + 2.0 * rest.noise):
+        rest = right if vague and len(self.compared.told + found) > 1 else rest
+        if rest.beyond > max(UNEXPLAINED * right.beyond, self.strange,
+                             UNEXPLAINED * self.noisy + 2.0 * rest.noise):
             found = [Finding('inaccurate', f'{100.0 * rest.beyond:.3g} % of the reading is not '
                              'that of the motion', rest.beyond)]
         return found, rest
@@ -235,7 +235,7 @@ class Causes:
         turn = Rotation.from_matrix(matrix)
         angle, near = float(turn.magnitude()), max(REAL, OF_TURN * change)
         return Finding('mounting', 'the axes of the readings are turned by '
-                       f'({listed(turn.inv().as_rotvec())}) rad from the mounting', angle) if (
+                       f'({listed(turn.inv().as_rotvec())}) rad from those given', angle) if (
             angle > self.strange and np.max(np.abs(matrix - turn.as_matrix())) < near) else None
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from spinning_top_sim.grade.columns import READINGS
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.table import Columns, numbers, read_columns
+from spinning_top_sim.table import Columns, column_numbers, read_columns
 from spinning_top_sim.times import NEVER_NS, stamp_text
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.cli import one_line
@@ -237,7 +237,7 @@ def _add(recorded: Recorded, columns: Columns, rows: Sequence[str], said: Chosen
     for kind, (names, units) in PARTS.items():
         pairs = [pair for name in names for pair in chosen.get(name, ())]
         source = ', '.join(f'{column} [{unit}]' for column, unit in pairs).replace(' [1]', '')
-        values = [units[unit] * numbers(columns, column, rows, exact=kind == 't')
+        values = [units[unit] * column_numbers(columns, column, rows, exact=kind == 't')
                   for column, unit in pairs]
         if kind == 't':
             stamps = sum(values)

@@ -132,7 +132,7 @@ def explain(model: Model, causes: Sequence[Cause],
 
     least : of the discrepancy, that needs no cause
 
-    A cause that is not what it seemed to be explains nothing.
+    If a chosen cause is not what it seemed to be, nothing is explained.
     """
     def fit_of(causes: Sequence[Cause]) -> Fit:
         return model.fit([name for cause in causes for name in cause.effects])
@@ -154,11 +154,12 @@ def explain(model: Model, causes: Sequence[Cause],
                  for cause, one in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * fit.beyond, fit.noise or np.inf),
                    TINY * nothing.beyond)
-        # Of equally good causes the one with the fewest effects wins, for more effects always fit
-        # better, then the one that leaves clearly least, then the one that is named first.
-        equal = [k for k, left in enumerate(after) if left <= good]
-        near = (1.0 + SURE ** 2 / model.count) * min(tried[k].rest for k in equal)
-        best = min(equal, key=lambda k: (len(others[k].effects), max(tried[k].rest, near)))
+        # Of equally good causes those with the fewest effects count, for more effects always fit
+        # better, and of these the first that leaves, but for chance, no more than any other.
+        equal = sorted((len(others[k].effects), k) for k, left in enumerate(after) if left <= good)
+        rests = [tried[k].rest for size, k in equal if size == equal[0][0]]
+        chance = SURE ** 2 / model.count * min(rests) + TINY * nothing.rest
+        best = equal[next(k for k, rest in enumerate(rests) if rest <= min(rests) + chance)][1]
         if after[best] > WORTHWHILE * fit.beyond:
             break
         chosen.append(others.pop(best))

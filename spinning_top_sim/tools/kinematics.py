@@ -127,8 +127,7 @@ class Stretch:
     @cached_property
     def matrices(self) -> Reals:
         """The rotations (n, 3, 3)."""
-        matrices: Reals = self.rotation.as_matrix()
-        return matrices
+        return np.asarray(self.rotation.as_matrix())
 
 
 class Smoothed:
