@@ -129,8 +129,8 @@ def test_a_simulation_without_a_node(browser, tmp_path):
             visit.wait("[...document.querySelectorAll('.top-legend')].some("
                        "e => e.textContent.includes('torque'))")
             visit.choose('scene', 'shuttle')
+            visit.read('The pivot moves')       # a click meanwhile closes the list of scenes
             visit.press('Play')
-            visit.read('The pivot moves')
             visit.wait("window.__viserMutable.nodePoseData['/ground'].position[0] < 0")
         assert own.end(signal.SIGTERM) == 0, own.err
 
