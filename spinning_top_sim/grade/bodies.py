@@ -119,7 +119,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     """
     Return how attitudes are told: ours, unless another explains readings that ours does not.
 
-    Axes of the sensor, and turns about z, are left to readings, a z that is down to gravity.
+    The readings tell axes of the sensor and turns about z, gravity tells a z that points down.
     """
     group = [one for one in conventions.group() if 'sensor' not in one.name and (
         one.conjugate or one.world[3] > 0.9 or Rotation.from_quat(one.world).apply(UP)[2] < 0.9)]

@@ -48,8 +48,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
             any(kind in one.readings for one in stretches)))
     shift = compared.lag()
     model, found, rest = _explained(compared, shift)
-    if found or rest.beyond > STRANGE:
-        other = compared.exchanged(shift)
+    if (found or rest.beyond > STRANGE) and (other := compared.exchanged(shift)).told:
         another, others, left = _explained(other, shift)
         if ((cost(others) < cost(found) and left.beyond < rest.beyond + REAL)
                 or left.beyond + STRANGE < UNEXPLAINED * rest.beyond):
@@ -57,7 +56,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     right, alone = model.fit([]), model.fit(['step'])
     either = len(found) == 1 and alone.beyond < UNEXPLAINED * right.beyond  # it may be a lag, too
     late, sigma, unjudged = math.nan, math.inf, [*_untold(compared, model)]
-    # If there is nothing else; unless it is none, whatever matrix, bias and a x r there are.
+    # The lag alone and, unless that is none, beside any matrix, bias and a x r.
     whatever = model.fit(['step', *MATRIX, *OFFSETS, *(k for k in model.names if 'turned' in k)])
     for fit in [alone] if either else [whatever] if found else [alone, whatever]:
         if not abs(late) + 1.96 * sigma <= LATE:
@@ -66,8 +65,9 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> 
     name = 'early' if late < 0.0 else 'late'
     text = (f'the readings are {abs(late):.3g} {_interval(sigma)} steps of '
             f'{1e3 * compared.own_step:.3g} ms {name}')
-    near = abs(late / compared.steps - shift) < 1.5     # else it is no lag that `step` tells
-    is_late = abs(late) > max(LATE + 1.96 * sigma, SURE * sigma) and (  # noise hides it from lag
+    # `step` tells lags near `shift`, beside another fault only those that noise hides from `lag`.
+    near = abs(late / compared.steps - shift) < 1.5
+    is_late = abs(late) > max(LATE + 1.96 * sigma, SURE * sigma) and (
         near if shift or (found and compared.noisy and not either) else not found)
     if not is_late and not abs(late) + 1.96 * sigma <= LATE and (either or not found):
         or_else = found[0].evidence if found else 'there is no fault'
