@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pivot that moves: paths as parameters, commanded velocities, and what is sent about it."""
 
+import json
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from helpers.simulations import drive, run, simulate
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.events import Event
 
 S = 10 ** 9
 SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
@@ -31,9 +33,9 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     drive(simulation, 0.0, 0.8, 0.0)
     goes_to(simulation, 3 * S // 2)
     drive(simulation, 0.0, 0.8, 0.0)                # to repeat it only lasts longer
-    (event,) = simulation.history
+    event = Event.from_mapping(json.loads(*simulation.history))
     assert (event.t_ns, event.details['stop_ns']) == (S, 5 * S // 2)
-    assert not type(event)('drive', 5 * S // 2, 0, event.details).repeats(event), 'it brakes then'
+    assert not Event('drive', 5 * S // 2, 0, event.details).repeats(event), 'it brakes then'
     assert simulation.trajectory.starts(S + S // 2, 2 * S) == []
     position, velocity = goes_to(simulation, 10 * S)
     # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.

@@ -88,7 +88,7 @@ def test_each_difference_is_counted_and_the_first_is_told_with_field_stamp_and_v
 
 def test_the_journal_is_obeyed(short, tmp_path, capsys):
     """A digit of a commanded momentum makes another motion; a rate may change before t = 0."""
-    event = Event('parameters', 0, -1, {'pose.rate': 100.0}).as_mapping()
+    event = json.loads(Event('parameters', 0, -1, {'pose.rate': 100.0}).text)
     with LogReader(short) as reader:
         values = json.loads(reader.metadata['spinning_top_sim']['parameters'])
     before = {'history': json.dumps([event]),

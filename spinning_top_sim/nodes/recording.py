@@ -55,7 +55,7 @@ class Recording:
         recorder = Recorder(
             values['record.uri'], [RecordedTopic(*topic) for topic in self._topics(channels)],
             partial(run_metadata, simulation.values_at_start, simulation.epoch_ns,
-                    simulation.sent_ns, map(Event.as_mapping, tuple(simulation.history)), values),
+                    simulation.sent_ns, tuple(simulation.history), values),
             max_loss=values['record.max_loss'], compression=values['record.compression'],
             min_free_bytes=values['record.min_free_bytes'], **self._options)
         self.error, self._recorder, self._events_index = None, recorder, len(channels)

@@ -19,14 +19,13 @@ LIBRARIES = ('numpy', 'mcap', 'gmpy2', 'pymap3d')   # those installed decide the
 
 
 def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-                 history: Iterable[Mapping[str, Any]],
-                 values_at_recording: Mapping[str, Any]) -> dict[str, str]:
+                 history: Iterable[str], values_at_recording: Mapping[str, Any]) -> dict[str, str]:
     """
     Return the metadata record METADATA_NAME, but for the `environment`.
 
     values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns, begun_ns : stamp of t = 0; simulated time at which the recording begins
-    history : the events before, as in ~/events
+    history : the events before, each as in ~/events
     """
     return {
         'format': FORMAT,
@@ -35,8 +34,7 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
         'seed': str(values_at_start['seed']),
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
-        # One by one, so that other threads get their turn.
-        'history': f'[{", ".join(json.dumps(event, default=list) for event in history)}]'}
+        'history': f'[{", ".join(history)}]'}
 
 
 def environment() -> dict[str, str]:

@@ -19,6 +19,7 @@ COMMANDS, EVENTS = '~/commands', '~/events'
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
 COMMAND = messages.float64_multi_array(('l3', 'lz'))        # an applied one, as it is logged
 MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
+RESTARTS = (*MOTIONS, 'reset')
 CHANGES = (*MOTIONS, 'parameters', 'epoch', 'reset')        # all but the start of a recording
 # The details of each event and what reads them; 'parameters' has those that change.
 _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
@@ -46,26 +47,20 @@ class Event:
     sent_ns: int
     details: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def begins_motion(self) -> bool:
-        return self.kind in MOTIONS
-
-    @property
-    def begins_report(self) -> bool:
-        """Whether a motion of a report begins: with a recording, a change, or a reset."""
-        return self.kind in (*MOTIONS, 'start', 'reset')
-
     def repeats(self, last: 'Event') -> bool:
         """Return whether this is a drive that puts off the end of another, and does no more."""
         return (self.kind == last.kind == 'drive' and self.t_ns < last.details['stop_ns']
                 and all(self.details[axis] == last.details[axis] for axis in 'xyz'))
 
-    def as_mapping(self) -> dict[str, Any]:
-        return {'event': self.kind, 't_ns': self.t_ns, 'sent_ns': self.sent_ns, **self.details}
+    @property
+    def text(self) -> str:
+        """The event in JSON, as it is logged."""
+        return json.dumps({'event': self.kind, 't_ns': self.t_ns, 'sent_ns': self.sent_ns,
+                           **self.details}, default=list)
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Self:
-        """Return the event that `as_mapping` describes.  Raises one of MALFORMED for any other."""
+        """Return the event whose `text` has this mapping.  Raises one of MALFORMED otherwise."""
         given = dict(mapping)
         kind, t_ns, sent_ns = given.pop('event'), given.pop('t_ns'), given.pop('sent_ns')
         if kind == 'parameters':
@@ -88,7 +83,7 @@ class Event:
 
     def entries(self) -> list[tuple[str, bytes]]:
         """Return what is logged of the event: topics and messages; std_msgs/String of JSON."""
-        logged = [(EVENTS, messages.string(json.dumps(self.as_mapping(), default=list)))]
+        logged = [(EVENTS, messages.string(self.text))]
         if self.kind == 'command':
             logged.append((COMMANDS, COMMAND.encode_one(
                 0, (self.details['l3'], self.details['lz']))))

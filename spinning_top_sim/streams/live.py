@@ -20,7 +20,7 @@ import numpy as np
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.channel import Channel, Rows
-from spinning_top_sim.streams.events import MOTIONS, Event
+from spinning_top_sim.streams.events import MOTIONS, RESTARTS, Event
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NEVER_NS, Times
 
@@ -133,7 +133,7 @@ class LiveSimulation(Simulation):
         event = super().apply(kind, **details)
         for output, channel in zip(self.outputs, self.channels, strict=True):
             output.channel = channel
-        if event.begins_motion or kind == 'reset':
+        if kind in RESTARTS:
             self._motion = _Progress(self.sent_ns, FIRST_STRIDE_NS)
         self.refresh()
         return event

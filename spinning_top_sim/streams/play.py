@@ -11,7 +11,7 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel, Messages, Samples
-from spinning_top_sim.streams.events import CHANGES, Event
+from spinning_top_sim.streams.events import CHANGES, MOTIONS, Event
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
@@ -38,7 +38,7 @@ class Simulation:
     trajectory : the motion
     imu, channels : the sensor and all streams, with their present rates
     sent_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
-    history : the events since the start
+    history : the events since the start, as `Event.text`, which takes the least memory
     epoch_ns : stamp of t = 0 [ns]
 
     Raises ValueError where there is no motion from the start state.
@@ -60,7 +60,8 @@ class Simulation:
         self.channels = all_channels(values, imu)
         self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
         self.values_at_start, self.values_in_effect = dict(values), dict(values)
-        self.history: list[Event] = []
+        self.history: list[str] = []
+        self._last: Event | None = None     # of these
         self.sent_ns = -1
         # The trace of the markers and late fixes look back at the pivot, across events; only
         # readings look back at states, by `Imu.memory_ns`.
@@ -86,7 +87,7 @@ class Simulation:
             self._restart(details['parameters'], details['epoch_ns'])
             return Event(kind, 0, sent_ns, details)
         event = Event(kind, self.now_ns, sent_ns, details)
-        if event.begins_motion:
+        if kind in MOTIONS:
             self.trajectory = self.trajectory.then(event)
             self.sent_ns = event.t_ns
         elif kind == 'parameters':
@@ -99,10 +100,12 @@ class Simulation:
             self.epoch_ns = details['epoch_ns']
         else:
             raise ValueError(f'event {kind!r}: must be one of {", ".join(CHANGES)}')
-        if self.history and event.repeats(self.history[-1]):    # it lasts longer
-            self.history[-1] = replace(self.history[-1], details=details)
+        if self._last and event.repeats(self._last):    # it lasts longer
+            self.history.pop()
+            self._last = replace(self._last, details=details)
         else:
-            self.history.append(event)
+            self._last = event
+        self.history.append(self._last.text)
         return event
 
     def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams.events import RESTARTS
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.view.page import Page
 from spinning_top_sim.view.player import Player
@@ -40,8 +41,8 @@ class LogSource:
             raise LogError(f'{path}: no attitude of the top in it ({", ".join(TOPICS)})')
         # A sample at the instant of an event belongs to the motion before it.
         changes_ns = [int(stamp_ns) - run.epoch_ns for begin_ns, event in run.events
-                      if event.begins_report and event.kind != 'start' for stamp_ns in
-                      self.track.stamps_ns[self.track.stamps_ns > begin_ns][:1]]
+                      if event.kind in RESTARTS
+                      for stamp_ns in self.track.stamps_ns[self.track.stamps_ns > begin_ns][:1]]
         self.page = open_page()
         self.page.message.content = ' '.join(
             f'*{path.name} {note}*' for note, is_so in notes.items() if is_so)
