@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
 import signal
@@ -139,7 +140,7 @@ def _cannot_start(name: str, error: Exception) -> int:
 
 
 def _executor(node: Any) -> Executor:
-    """Return an executor with the node; leave little to the garbage collector."""
+    """Return an executor with the node; let what it frees be found soon and given back."""
     try:                    # this executor takes the least processor time
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
     except ImportError:
@@ -150,7 +151,9 @@ def _executor(node: Any) -> Executor:
     node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
     gc.collect()
     gc.freeze()             # a full collection then skips all objects of the start
-    gc.collect()            # finds nothing, so that the next full collection comes soon
+    node.create_timer(60.0, gc.collect)         # it clears the tuples that Python keeps, too
+    with contextlib.suppress(AttributeError):       # glibc would keep freed blocks of recordings
+        ctypes.CDLL(None).mallopt(-3, 128 * 1024)   # M_MMAP_THRESHOLD of malloc.h
     return executor
 
 

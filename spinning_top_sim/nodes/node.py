@@ -217,10 +217,7 @@ class Simulator(Node):
         return response
 
     def _set_pause(self, request: SetBool.Request) -> str:
-        if request.data:
-            self.loop.pause()
-        else:
-            self.resume()
+        (self.loop.pause if request.data else self.resume)()
         return f'{self.loop.state.value} {self.loop.time_text}'
 
     def resume(self) -> None:

@@ -77,10 +77,10 @@ class ChannelPublishers:
     def update_subscribers(self) -> None:
         """Connect the outputs that have subscribers."""
         for output in self._simulation.outputs:
-            publisher = self.by_topic.get(output.channel.topic)
-            wanted = publisher is not None and publisher.get_subscription_count() > 0
-            if wanted != (output.publish is not None):
-                output.publish = publisher.publish if wanted and publisher else None
+            one = self.by_topic.get(output.channel.topic)
+            publish = one.publish if one and one.get_subscription_count() else None
+            if publish != output.publish:
+                output.publish = publish
                 self._simulation.refresh()
 
     def topics_to_record(self, channels: Sequence[Channel]) -> list[Topic]:
