@@ -31,15 +31,16 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     goes_to(simulation, S)
     assert simulation.drive_details((0.0, 0.0, 0.0)) is None, 'it rests'
     drive(simulation, 0.0, 0.8, 0.0)
-    goes_to(simulation, 3 * S // 2)
-    drive(simulation, 0.0, 0.8, 0.0)                # to repeat it only lasts longer
+    for t_ns in (3 * S // 2, 11 * S // 5):
+        goes_to(simulation, t_ns)
+        drive(simulation, 0.0, 0.8, 0.0)            # to repeat it only lasts longer
     event = Event.from_mapping(json.loads(*simulation.history))
-    assert (event.t_ns, event.details['stop_ns']) == (S, 5 * S // 2)
-    assert not Event('drive', 5 * S // 2, 0, event.details).repeats(event), 'it brakes then'
-    assert simulation.trajectory.starts(S + S // 2, 2 * S) == []
+    assert (event.t_ns, event.details['stop_ns']) == (S, 16 * S // 5)
+    assert not Event('drive', 16 * S // 5, 0, event.details).repeats(event), 'it brakes then'
+    assert simulation.trajectory.starts(S + S // 2, 3 * S) == []
     position, velocity = goes_to(simulation, 10 * S)
-    # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.
-    assert position == pytest.approx((0.0, 0.8 * 1.5, 0.0), abs=1e-12) and not velocity.any()
+    # Half a ramp of 0.4 s at each end, and 1.8 s of cruise.
+    assert position == pytest.approx((0.0, 0.8 * 2.2, 0.0), abs=1e-12) and not velocity.any()
     # Repeated while it brakes, it is another command: the pivot goes on from there.
     drive(simulation, 0.0, 0.8, 0.0)
     before = goes_to(simulation, 11 * S + S // 5)

@@ -184,6 +184,9 @@ def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
     for act in (lambda: run.command(1.0), lambda: run.loop.step(POSE_NS), run.loop.resume):
         with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
             act()
+    with pytest.raises(ValueError, match='2038'):       # a reset that is refused leads nowhere
+        run.loop.reset({**run.values, 'duration': 1e10})
+    assert run.loop.state is LoopState.FAILED
     assert run.ticks(5).simulation.now_ns == stands_at
     run.loop.reset(simulate().values_at_start)
     assert run.loop.failure is None and run.ticks(404).simulation.now_ns > stands_at

@@ -15,10 +15,11 @@ def test_jumps_give_the_step_response_of_the_filter(order):
     """Of the rate about the axis by a command, of the force where the acceleration changes."""
     from scipy import signal
 
-    path = {'pivot.path': (0.1, 0.0, 0.0, 2.0, 0.1500001, 0.0, 0.0, -9.80665)}
+    # 1.001e9 is no double.
+    path = {'pivot.path': (1.001, 0.0, 0.0, 2.0, 0.1500001, 0.0, 0.0, -9.80665)}
     values = {**STANDING, **path, 'spin.l3': 1.0, 'spin.lz': 1.0, 'imu.rate': 1000.0,
               'imu.bandwidth': 10.0, 'imu.bandwidth_order': order}
-    _, found = run(values, SECOND, 'imu/data_raw', events=[
+    _, found = run(values, 2 * SECOND, 'imu/data_raw', events=[
         (300 * MILLISECOND + 123, 'command', {'l3': 2.0, 'lz': 2.0})])
     times_ns, _, rates, force = found['imu/data_raw']
     b, a = signal.butter(order, math.tau * 10.0, analog=True)
@@ -30,7 +31,7 @@ def test_jumps_give_the_step_response_of_the_filter(order):
 
     assert rates[:, 2] * 0.15 == pytest.approx(1.0 + step(300_000_123), abs=1e-8)
     assert force[:, 2] - 9.80665 == pytest.approx(
-        2.0 - 11.80665 * step(100 * MILLISECOND) + 9.80665 * step(250_000_100), abs=1e-7)
+        2.0 - 11.80665 * step(1_001 * MILLISECOND) + 9.80665 * step(1_151_000_100), abs=1e-7)
 
 
 PROFILE = (20.0, 0.1, 80.0, 0.4, 350.0, 0.4, 800.0, 0.07)

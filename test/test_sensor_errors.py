@@ -123,10 +123,10 @@ def test_the_chain_by_hand():
     values = {'imu.gyroscope_M': (2.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0),
               'imu.gyroscope_A': (0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
               'imu.accelerometer_M': (1.0, 0.0, 1.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0),
-              'imu.gyroscope_resolution': 0.5, 'imu.gyroscope_range': 7.2,
+              'imu.gyroscope_resolution': 0.5, 'imu.gyroscope_range': 7.3,
               'imu.accelerometer_range': 10.5}
     rows, _ = read(values, range(0, 2, 1), ((1.0, 2.0, 9.0), (0.3, 4.0, 10.0)))
-    # x: 2 + 1 + 2.5 = 5.5; z: -9 + 0.3 of the true force = -8.7, cut at the code 7.0 within 7.2.
+    # x: 2 + 1 + 2.5 = 5.5; z: -9 + 0.3 of the true force = -8.7, cut at the code 7.0 within 7.3.
     assert rows.tolist() == 2 * [[5.5, 2.0, -7.0, 10.3, 10.5, 10.0]]
 
 

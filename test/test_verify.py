@@ -101,6 +101,9 @@ def test_the_journal_is_obeyed(short, tmp_path, capsys):
         short, tmp_path / 'run.mcap', lambda topic, number, data: (
             data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['different'] > 100
+    spaced = rewritten(short, tmp_path / 'spaced', lambda topic, number, data: (
+        data.replace(b'"l3": 1.7', b'"l3":1.70') if topic.endswith('/events') else data))
+    assert 'are not as it was written' in told(capsys, spaced, '--verify')[2]
 
 
 def test_a_log_of_1_is_read_and_verified_by_1(capsys):

@@ -188,7 +188,8 @@ def read(path, *, verified):
 
 
 def verify(reader):
-    run = read_run_description(reader)
+    run, texts = read_run_description(reader), reader.metadata['spinning_top_sim']
+    assert texts['seed'] == str(json.loads(texts['parameters'])['seed'])
     if not reader.lost_bytes:
         comparison = compare(run, reader)
         assert comparison.identical, comparison.first or comparison.stopped

@@ -158,7 +158,7 @@ def _kinds(chance, topics, values):
         (3, 'reset', lambda: (pick((None, None, True, False)),)),
         (2, 'change', lambda: (dict.fromkeys(rates, pick((20.0, 33.0, 100.0, 250.0))),)),
         (1, 'change', lambda: ({'time_scale': pick((0.3, 1.0, 2.0))},)),
-        (1, 'change', lambda: ({'tick_rate': pick((20.0, 100.0, 300.0))},)),
+        (1, 'change', lambda: ({'tick_rate': pick((20.0, 100.0, 300.0)), 'seed': 1000},)),
         (3, 'start_recording', tuple),
         (2, 'stop_recording', tuple),
         (2, 'listen', topic),
