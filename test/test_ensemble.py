@@ -197,7 +197,6 @@ def test_every_stream_has_columns_also_with_outages_and_unset_values(tmp_path):
     ({'sample': {'spin.l3': {'log_uniform': [0, 1]}}}, '[0, 1]}: must be values'),
     ({'sample': {'top.mass': {'uniform': [1, 1e31]}}}, 'top.mass = 1e+31: must be a number >= 0'),
     ({'sample': {'markers.trace_points': {'uniform': [1.5, 2]}}}, '1.5: must be an integer'),
-    ({'sample': {'use_sim_time': {'values': [True]}}}, 'there is no parameter use_sim_time'),
     ({'streams': ['imu', 'markers']}, 'must be one of pose'),
     ({'duration': 0}, 'duration = 0: must be a number >= 1e-09'),
     ({'run': 3}, 'must be a mapping with runs')])

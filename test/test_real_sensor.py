@@ -15,7 +15,6 @@ def test_jumps_give_the_step_response_of_the_filter(order):
     """Of the rate about the axis by a command, of the force where the acceleration changes."""
     from scipy import signal
 
-    # 1.001e9 is no double.
     path = {'pivot.path': (1.001, 0.0, 0.0, 2.0, 0.1500001, 0.0, 0.0, -9.80665)}
     values = {**STANDING, **path, 'spin.l3': 1.0, 'spin.lz': 1.0, 'imu.rate': 1000.0,
               'imu.bandwidth': 10.0, 'imu.bandwidth_order': order}
