@@ -80,6 +80,8 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': Tr
     ({'imu.vibration.rate_psd': (1e-300, 1e-300, 1e6, 1e6)}, 'rate_psd.*0 or >= 1e-100'),
     ({'mag.disturbance.body': (2.0, 1.0, 0.0, 0.0, 0.0)}, 'must not end before'),
     ({'imu.bandwidth': 9.0, 'imu.sampling': 'mean'}, 'imu.bandwidth = 9.0: must be 0 with'),
+    ({'mag.disturbance.world': ()}, 'world.*a list of 5 numbers, or a multiple'),
+    ({'gnss.origin': (90.5, 0.0, 0.0)}, 'gnss.origin'),
     ({'gnss.outages': (1.0, 3.0, 2.0, 4.0)}, 'gnss.outages'),
     ({'pivot.path': (1.0, 2.0, 3.0)}, 'pivot.path = .*4 numbers, or a multiple'),
     ({'pivot.path': (1e-6, 0.0, 0.0, 0.0)}, 'duration 1e-06 s: must be >= 0.001'),

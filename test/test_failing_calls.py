@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Each system call of what writes a file fails once, in every way: nothing promised is lost.
-
-And nothing is left that claims to be whole and is not.
-"""
+"""Each system call that writes a file fails in turn: nothing is lost that was promised."""
 
 import errno
 import random
@@ -65,7 +61,7 @@ def test_of_a_recording(tmp_path):
             return
         kept = [stamp for _, stamp, _ in seen_by_us(path)]
         assert kept == list(range(written)), failure
-        if recorder.error is None:      # a short write is made good
+        if recorder.error is None:      # it fails to close, or writes less at first
             with LogReader(path) as reader:
                 assert reader.whole and len(kept) == 100, failure
             assert not failure or failure.startswith('close') or failure.endswith('None'), failure

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands and parameters of a node: what they do, what is refused, and what the user is told."""
 
+import inspect
 import math
 
 import numpy as np
@@ -122,6 +123,7 @@ def test_a_stream_that_cannot_be_published_is_refused_before_anything_changes(tm
 def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
     """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""
     timers = {*node.node.timers}
+    assert not any(inspect.signature(one.callback).parameters for one in timers)    # TimerInfo
     assert node.set(solver__rtol='1e-9', imu__gyroscope_noise_density='5e-5', duration=0,
                     imu__lever_arm=['1e-2', '0e0', '2e0']).successful
     assert node.get('solver.rtol', 'imu.gyroscope_noise_density', 'duration') == [1e-9, 5e-5, 0.0]

@@ -97,9 +97,8 @@ def test_the_journal_is_obeyed(short, tmp_path, capsys):
                                    ('begun', lambda topic, number, data: (     # then killed
                                        None if '/events' not in topic or number else data), {})):
         assert verified(capsys, rewritten(short, tmp_path / name, change, metadata))['identical']
-    verdict = verified(capsys, rewritten(
-        short, tmp_path / 'run.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
+    verdict = verified(capsys, rewritten(short, tmp_path / 'run', lambda topic, number, data: (
+        data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['different'] > 100
     spaced = rewritten(short, tmp_path / 'spaced', lambda topic, number, data: (
         data.replace(b'"l3": 1.7', b'"l3":1.70') if topic.endswith('/events') else data))

@@ -338,6 +338,7 @@ sys.exit(main(['view', '--scene', 'wavy', '--html', {str(path)!r}, '-p', 'durati
 
 @pytest.mark.parametrize(('arguments', 'told'), [
     (['LOG', '--imu', 'bmi088'], '--imu: cannot be given for a log'),
+    (['LOG', '--node'], '--node: cannot be given for a log'),
     (['--namespace', 'left'], '--namespace: cannot be given for a simulation'),
     (['--ros-args', '-r', '__ns:=/left'], '--ros-args -r __ns:=/left: must be with --node'),
     (['-p', 'top.mas:=3'], 'there is no parameter top.mas; did you mean top.mass?'),

@@ -34,12 +34,11 @@ class SimulatedClock:
                  steady: Reading = time.monotonic_ns) -> None:
         self.date, self.steady, self._warn, self._publishers = date, steady, warn, publishers
         self.follows, self._source = follows, date if follows else steady
-        self._scale = 1.0
+        self._scale, self._told_of_several = 1.0, False
         self._source_ns = self._simulated_ns = 0    # the anchor: two times of one moment
         self._newest_ns = 0                         # of the source
         self._late_ns = 0                           # what was due LATEST_NS ago
         self._became_due: deque[tuple[int, int]] = deque()      # steady and simulated times
-        self._told_of_several = False
 
     def next_epoch(self, last_stamp_ns: int = 0) -> int:
         """

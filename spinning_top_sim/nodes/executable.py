@@ -140,7 +140,7 @@ def _cannot_start(name: str, error: Exception) -> int:
 
 
 def _executor(node: Any) -> Executor:
-    """Return an executor with the node; let what it frees be found soon and given back."""
+    """Return an executor with the node; keep the memory of the process small."""
     try:                    # this executor takes the least processor time
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
     except ImportError:
@@ -151,8 +151,8 @@ def _executor(node: Any) -> Executor:
     node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
     gc.collect()
     gc.freeze()             # a full collection then skips all objects of the start
-    node.create_timer(60.0, gc.collect)         # it clears the tuples that Python keeps, too
-    with contextlib.suppress(AttributeError):       # glibc would keep freed blocks of recordings
+    # glibc gives freed blocks of this size back, and by itself would raise it (solvers.evaluate).
+    with contextlib.suppress(AttributeError):       # where another libc has no such function
         ctypes.CDLL(None).mallopt(-3, 128 * 1024)   # M_MMAP_THRESHOLD of malloc.h
     return executor
 

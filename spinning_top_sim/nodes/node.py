@@ -5,6 +5,7 @@ The node `spinning_top`: connects a simulation to topics, services and parameter
 Everything happens in the thread of the executor; a steady timer ticks.
 """
 
+import gc
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -87,6 +88,7 @@ class Simulator(Node):
         sys.setswitchinterval(1e-4)
         self._report = NodeStatus(self.simulation, self.loop, self._recording)
         self._every('diagnostics', 1.0, self._publish_diagnostics)
+        self._every('collection', 60.0, partial(gc.collect, 2))     # else a full one is rare
         if period := self.values_next['status_period']:
             self._every('status', period, lambda: tell(self._report.status_line()))
         self._begin()

@@ -52,13 +52,12 @@ def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) 
 
 def warn_of_disobeyed(node: Node, overrides: Iterable[str]) -> None:
     """Warn of each name of qos_overrides that no publisher of a node has used."""
-    prefix = 'qos_overrides.'
     used = node.get_parameters_by_prefix('qos_overrides')
     for name in overrides:
-        if name.startswith(prefix) and not node.has_parameter(name):
+        if name.startswith('qos_overrides.') and not node.has_parameter(name):
             node.get_logger().warning(
                 f'{name} is not obeyed: no publisher has this topic and policy'
-                f'{likely_name(name, used, prefix)}')
+                f'{likely_name(name, used, "qos_overrides.")}')
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:

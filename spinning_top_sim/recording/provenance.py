@@ -25,7 +25,7 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
 
     values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns, begun_ns : stamp of t = 0; simulated time at which the recording begins
-    history : the events before, each as in ~/events
+    history : the JSON of each event before
     """
     return {
         'format': FORMAT,

@@ -36,6 +36,7 @@ HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the thr
 SPLITTER = 134217729.0
 # Once glibc has freed a block of this size, it keeps freed memory for large arrays instead of
 # clearing the pages again [mallopt(3)]: 20 000 attitudes take 0.9 ms, and would take 2.3 ms.
+# A node, which computes little at once, gives the memory back (nodes.executable).
 np.empty(2 ** 22, np.uint8)
 
 

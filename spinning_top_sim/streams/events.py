@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What changes a run: one type, in memory, in the topic ~/events and in the metadata of a log.
+What changes a run: one type, logged as JSON in ~/events and in the metadata.
 
 With the parameters in a log's metadata, its events are enough to compute every message again.
 """
@@ -19,7 +19,7 @@ COMMANDS, EVENTS = '~/commands', '~/events'
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
 COMMAND = messages.float64_multi_array(('l3', 'lz'))        # an applied one, as it is logged
 MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
-RESTARTS = (*MOTIONS, 'reset')
+RESTARTS = (*MOTIONS, 'reset')              # after which another motion goes on
 CHANGES = (*MOTIONS, 'parameters', 'epoch', 'reset')        # all but the start of a recording
 # The details of each event and what reads them; 'parameters' has those that change.
 _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
@@ -60,7 +60,7 @@ class Event:
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Self:
-        """Return the event whose `text` has this mapping.  Raises one of MALFORMED otherwise."""
+        """Return the event that its decoded `text` describes.  Raises one of MALFORMED."""
         given = dict(mapping)
         kind, t_ns, sent_ns = given.pop('event'), given.pop('t_ns'), given.pop('sent_ns')
         if kind == 'parameters':

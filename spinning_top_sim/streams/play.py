@@ -38,7 +38,7 @@ class Simulation:
     trajectory : the motion
     imu, channels : the sensor and all streams, with their present rates
     sent_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
-    history : the events since the start, as `Event.text`, which takes the least memory
+    history : `Event.text` of each event since the last reset; drives that are repeated are one
     epoch_ns : stamp of t = 0 [ns]
 
     Raises ValueError where there is no motion from the start state.
@@ -61,7 +61,7 @@ class Simulation:
         self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
         self.values_at_start, self.values_in_effect = dict(values), dict(values)
         self.history: list[str] = []
-        self._last: Event | None = None     # of these
+        self._last: Event | None = None     # the event of the last text
         self.sent_ns = -1
         # The trace of the markers and late fixes look back at the pivot, across events; only
         # readings look back at states, by `Imu.memory_ns`.
