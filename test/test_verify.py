@@ -88,10 +88,10 @@ def test_each_difference_is_counted_and_the_first_is_told_with_field_stamp_and_v
 
 def test_the_journal_is_obeyed(short, tmp_path, capsys):
     """A digit of a commanded momentum makes another motion; a rate may change before t = 0."""
-    event = json.loads(Event('parameters', 0, -1, {'pose.rate': 100.0}).text)
+    event = Event('parameters', 0, -1, {'pose.rate': 100.0})
     with LogReader(short) as reader:
         values = json.loads(reader.metadata['spinning_top_sim']['parameters'])
-    before = {'history': json.dumps([event]),
+    before = {'history': f'[{event.text}]',
               'parameters': json.dumps({**values, 'pose.rate': 50.0})}
     for name, change, metadata in (('same', lambda topic, number, data: data, before),
                                    ('begun', lambda topic, number, data: (     # then killed
