@@ -28,6 +28,7 @@ CONTENT = st.recursive(
 @given(YAML | CONTENT.map(lambda content: yaml.dump({'/**': {'ros__parameters': content}},
                                                     allow_unicode=True)))
 @example(f'/**: {{ros__parameters: {{imu.rpy: [1.0, {1 << 15_000:#x}]}}}}')
+@example('/**: {ros__parameters: {top.lambda1: 5.0e-234}}')
 @example('/**: &a {b: *a}')
 def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
     path = tmp_path / 'scene.yaml'
