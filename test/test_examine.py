@@ -60,20 +60,18 @@ def test_a_wrong_filter_is_named_by_its_area_and_nothing_else(report, name):
     assert found.found[0].evidence in str(found)
 
 
-@pytest.mark.parametrize('name', ['vqf', 'vqf, six axes', 'mahony, slow', 'mahony, float32',
-                                  'mahony, corrects first'])
+@pytest.mark.parametrize('name', ['vqf', 'vqf, six axes', 'mahony, corrects first'])
 def test_a_right_filter_passes(report, name):
     found = report(name)
     assert found.passed, found
 
 
-@pytest.mark.parametrize('reports', [True, False])
-def test_a_filter_without_an_estimate_of_a_bias_is_right_unless_it_reports_one(reports):
+def test_a_filter_without_an_estimate_of_a_bias_is_right_unless_it_reports_one(report):
     class NoEstimate(Part):
-        bias = np.zeros(3) if reports else None
+        bias = None
 
     found = examine(partial(NoEstimate, partial(Mahony, 0.5, 0.5, 0.0)), seeds=1)
-    assert found.faults == ['bias'] * reports
+    assert found.passed and report('no bias').faults == ['bias']
     assert found.measures['bias_tilt_s'] == pytest.approx(2.0, rel=0.1)
 
 

@@ -246,7 +246,7 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     monkeypatch.setenv('HOME', str(tmp_path))
     (tmp_path / 'old').mkdir()
     dated = r'spinning_top_\d{4}(-\d\d){2}_\d\d(-\d\d){2}_\d{6}\.mcap'
-    for uri, path in (('run.mcap', r'run\.mcap'), ('new/er/', f'new/er/{dated}'),
+    for uri, path in (('run.mcap', r'run\.mcap'), *2 * (('new/er/', f'new/er/{dated}'),),
                       ('~/old', f'old/{dated}'), ('plain', 'plain'), ('', dated), ('', dated)):
         recorder = record(uri, [])
         assert re.fullmatch(f'{tmp_path}/{path}', str(recorder.path))
@@ -261,4 +261,4 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     assert twice.error == "topic '/top/pose' is listed twice: once is allowed"
     long = record('long.mcap', [], metadata=lambda: {'history': MAX_BYTES * ' '})
     assert 'too many events' in long.error and not (tmp_path / 'long.mcap').exists()
-    assert (tmp_path / 'run.mcap').read_bytes() == content and len(forgotten) == 11
+    assert (tmp_path / 'run.mcap').read_bytes() == content and len(forgotten) == 12

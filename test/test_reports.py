@@ -57,7 +57,8 @@ def test_the_worst_problem_is_told_and_the_real_time_factor_is_that_since_the_la
     recording.error = 'disk full'
     assert told()[:2] == (2, 'recording: disk full')
     line = report.status_line()
-    assert ' s paused | ' in line and ' | 12 messages to subscribers' in line
+    assert line.startswith('t      0.25 s paused | theta  41.21 deg | x')
+    assert line.endswith(' | 12 messages to subscribers')
     recording.error = None
     loop.fail('at a pole')
     assert told()[:2] == (2, 'at a pole') and ' s failed | ' in report.status_line()
