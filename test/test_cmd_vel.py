@@ -48,7 +48,8 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     after = goes_to(simulation, simulation.sent_ns)
     assert 0.0 < before[1][1] < 0.8 and len(simulation.history) == 3
     assert np.array_equal(before, after)
-    assert goes_to(simulation, 11 * S + S // 2)[1][1] == 0.8
+    drive(simulation, 0.0, 0.8, 0.4)        # another velocity along one axis alone
+    assert goes_to(simulation, 12 * S)[1].tolist() == [0.0, 0.8, 0.4]
 
 
 def test_a_command_that_ends_within_its_ramp_leaves_the_pivot_at_rest():
