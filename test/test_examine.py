@@ -284,5 +284,4 @@ def test_what_will_be_written_is_checked_before_the_exam(tmp_path, monkeypatch, 
 
 def test_published_filters_have_the_faults_that_they_are_known_for():
     pytest.importorskip('imufusion')
-    assert examine(FILTERS['imufusion'], seeds=1, feed=feeding.feed).faults == [
-        'integration']
+    assert examine(FILTERS['imufusion'], seeds=1, feed=feeding.feed).faults == ['integration']

@@ -253,8 +253,7 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
         with LogReader(recorder.path) as reader:
             assert reader.whole
     content = (tmp_path / 'run.mcap').read_bytes()
-    for uri, reason in (('run.mcap', 'File exists'),
-                        ('none/a.mcap', 'No such file or directory')):
+    for uri, reason in (('run.mcap', 'File exists'), ('none/a.mcap', 'No such file or directory')):
         assert record(uri, []).error == f'cannot write {tmp_path}/{uri}: {reason}'
     assert 'run.mcap' in record('run.mcap/', []).error
     twice = record('twice.mcap', [], [TOPICS[0], TOPICS[0]])

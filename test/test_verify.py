@@ -91,12 +91,14 @@ def test_the_journal_is_obeyed(short, tmp_path, capsys):
     event = Event('parameters', 0, -1, {'pose.rate': 100.0})
     with LogReader(short) as reader:
         values = json.loads(reader.metadata['spinning_top_sim']['parameters'])
-    before = {'history': f'[{event.text}]',
+    before = {'history': f'[{event.text}]', 'parameters_now': json.dumps({**values, 'seed': 7}),
               'parameters': json.dumps({**values, 'pose.rate': 50.0})}
     for name, change, metadata in (('same', lambda topic, number, data: data, before),
                                    ('begun', lambda topic, number, data: (     # then killed
                                        None if '/events' not in topic or number else data), {})):
         assert verified(capsys, rewritten(short, tmp_path / name, change, metadata))['identical']
+    # The seed waits for a reset.
+    assert as_json(capsys, tmp_path / 'same')[1]['run']['values_in_effect'] == values
     verdict = verified(capsys, rewritten(short, tmp_path / 'run', lambda topic, number, data: (
         data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['different'] > 100
