@@ -27,7 +27,7 @@ def pytest_xdist_make_scheduler(config, log):
 def pytest_collection_modifyitems(items):
     """Begin with the files of the longest tests, so that at the end no worker waits for one."""
     long = {f'test_{name}.py' for name in (
-        'world', 'grade_bodies', 'docs', 'blocks', 'view_browser', 'sim_node_life', 'grade')}
+        'docs', 'examine_live', 'view_browser', 'view_node', 'sim_node', 'sim_node_life')}
     items.sort(key=lambda item: item.path.name not in long)
 
 
