@@ -25,10 +25,10 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 def pytest_collection_modifyitems(items):
-    """Begin with the files of the longest tests, so that at the end no worker waits for one."""
-    long = {f'test_{name}.py' for name in (
+    """Begin with the files whose tests wait most, so that at the end no worker waits for one."""
+    waiting = {f'test_{name}.py' for name in (
         'docs', 'examine_live', 'view_browser', 'view_node', 'sim_node', 'sim_node_life')}
-    items.sort(key=lambda item: item.path.name not in long)
+    items.sort(key=lambda item: item.path.name not in waiting)
 
 
 @pytest.fixture(autouse=True)
