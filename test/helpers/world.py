@@ -263,6 +263,8 @@ class World:
         """Tick as a timer of rclpy does: on a grid, and what is long past is left out."""
         machine = self.machine
         while True:
+            if self._is_too_fast:       # also before an action, which may send what is due
+                raise Killed
             period_ns = int(self.loop.tick_period_ns)
             next_ns = machine.now_ns - machine.now_ns % period_ns + period_ns
             machine.sleep(max(min(next_ns, until_ns) - machine.now_ns, 0))
@@ -274,8 +276,6 @@ class World:
                 self._tick()
 
     def _tick(self):
-        if self._is_too_fast:
-            raise Killed
         if self._drives and self.loop.state is LoopState.RUNNING:
             with contextlib.suppress(ValueError, RuntimeError):     # the motion may end here
                 self.drive(len(self._drives) - 1, *self._drives[0])
