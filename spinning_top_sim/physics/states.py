@@ -250,11 +250,11 @@ class States:
             return f1, f2, f3
         r1, r2, r3 = point
         w1, w2, w3 = self.rows_angular_velocity
-        a1, a2, a3 = self.rows_angular_acceleration
+        a1, a2, _ = self.rows_angular_acceleration      # omega_3 is constant
         along = w1 * r1 + w2 * r2 + w3 * r3
         square = w1 * w1 + w2 * w2 + w3 * w3
-        return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + f1,
-                a3 * r1 - a1 * r3 + w2 * along - r2 * square + f2,
+        return (a2 * r3 + w1 * along - r1 * square + f1,
+                w2 * along - a1 * r3 - r2 * square + f2,
                 a1 * r2 - a2 * r1 + w3 * along - r3 * square + f3)
 
     def to_csv(self, path: FilePath) -> None:

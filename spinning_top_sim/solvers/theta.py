@@ -137,8 +137,7 @@ def _multiple_angles(first: Sequence[int], second: Sequence[int]) -> list[list[m
     while len(rows) < MOST_TERMS:
         rows.append([2 * a - 4 * b - c for a, b, c in zip_longest(
             rows[-1], [0, *rows[-1]], rows[-2], fillvalue=0)])
-    return [[mpfr(row[power]) if power < len(row) else ZERO for row in rows[power:]]
-            for power in range(MOST_TERMS)]
+    return [[mpfr(row[power]) for row in rows[power:]] for power in range(MOST_TERMS)]
 
 
 MULTIPLE_ANGLES = [_multiple_angles(*pair) for pair in FIRST_POLYNOMIALS]
