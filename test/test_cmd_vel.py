@@ -49,7 +49,8 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops():
     assert 0.0 < before[1][1] < 0.8 and len(simulation.history) == 3
     assert np.array_equal(before, after)
     drive(simulation, 0.0, 0.8, 0.4)        # another velocity along one axis alone
-    assert goes_to(simulation, 12 * S)[1].tolist() == [0.0, 0.8, 0.4]
+    position, velocity = goes_to(simulation, 12 * S)
+    assert velocity.tolist() == [0.0, 0.8, 0.4] and position[1] > after[0][1]
 
 
 def test_a_command_that_ends_within_its_ramp_leaves_the_pivot_at_rest():
@@ -57,6 +58,10 @@ def test_a_command_that_ends_within_its_ramp_leaves_the_pivot_at_rest():
     drive(simulation, 0.0, 0.8, 0.0)                # a ramp of 0.4 s, of which 0.1 s up and down
     position, velocity = goes_to(simulation, S)
     assert position == pytest.approx((0.0, 0.02, 0.0), abs=1e-12) and not velocity.any()
+    drive(simulation, 0.8, 0.0, 0.0)
+    goes_to(simulation, S + S // 20)
+    drive(simulation, 0.0, 0.8, 0.0)                # while it moves
+    assert not goes_to(simulation, 2 * S)[1].any()
 
 
 def momenta(states):

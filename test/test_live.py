@@ -6,16 +6,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from helpers.simulations import (
-    EPOCH_NS,
-    MILLISECOND,
-    SECOND,
-    output,
-    play,
-    record,
-    simulate,
-    times,
-)
+from helpers import simulations
+from helpers.simulations import EPOCH_NS, MILLISECOND, SECOND, output, play, record, simulate
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import dormand_prince
@@ -138,7 +130,7 @@ def test_after_a_change_of_the_rates_every_topic_goes_on_on_the_new_grid():
     simulation.send(until_ns)
     assert b'later' not in b''.join(data for *_, data in taken), 'at the next reset'
     for one in simulation.channels:
-        assert times(taken, one.topic) == [*range(0, changed_at + 1, MILLISECOND), *(
+        assert simulations.times(taken, one.topic) == [*range(0, changed_at + 1, MILLISECOND), *(
             t for t in range(0, until_ns + 1, round(SECOND / 33)) if t > changed_at)], one.topic
 
 

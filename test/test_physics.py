@@ -26,26 +26,33 @@ STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz
     *((State, STATE, field, value) for field, value in (
         ('theta', -1e-300), ('theta', math.nextafter(math.pi, 4.0)), ('phi', math.nan),
         ('lz', '1.0 kg'))),
-    *((State, {**STATE, 'theta': theta}, 'lz', lz) for theta, lz in (
-        (0.0, -1.6), (math.pi, 1.6))),      # at a pole only one is possible
     *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), 'precession': 1.0, 'spin': 2.0},
        field, value) for field, value in (
-           ('theta', -0.1), ('precession', math.nan), ('spin', '3 rad/s')))])
+           ('theta', math.nan), ('precession', math.nan), ('spin', '3 rad/s')))])
 def test_a_bad_constant_state_or_rate_is_refused_by_name_and_value(make, given, field, value):
     with pytest.raises(ValueError, match=rf'{field} = .*must ') as error:
         make(**{**given, field: value})
     assert repr(value) in str(error.value)
 
 
+@pytest.mark.parametrize(('theta', 'pole'), [(0.0, 'l3 = 1.6'), (math.pi, '-l3 = -1.6')])
+def test_at_a_pole_only_one_momentum_is_possible(theta, pole):
+    with pytest.raises(ValueError, match=rf'^lz = 0\.3 kg .* {theta} rad\) it must equal {pole}$'):
+        State(**{**STATE, 'theta': theta, 'lz': 0.3})
+
+
 @pytest.mark.parametrize('theta', [0.0, 1e-9, 0.7, 3.0, math.pi])
 def test_a_state_from_rates_turns_at_them(theta):
-    state = State.from_rates(theta, 3.0, -0.4, 12.0, top=Top(**TOP), phi=0.2, psi=-1.0)
-    motion = solve(Top(**TOP), state, [0.0])
+    top, turning = Top(**TOP), State.from_rates
+    assert turning(theta, 3.0, top=top) == turning(
+        theta, 3.0, 0.0, 0.0, top=top, phi=0.0, psi=0.0)
+    state = turning(theta, 3.0, -0.4, 3.0, top=top, phi=0.2, psi=-1.0)
+    motion = solve(top, state, [0.0])
     assert (state.theta, state.phi, state.psi) == (theta, 0.2, -1.0)
     assert motion.theta_dot[0] == pytest.approx(-0.4, rel=1e-14)
     # At a pole only the sum or the difference of the two has a meaning.
     turned = motion.psi_dot[0] + motion.phi_dot[0] * math.cos(theta)
-    assert turned == pytest.approx(12.0 + 3.0 * math.cos(theta), rel=1e-14)
+    assert turned == pytest.approx(3.0 + 3.0 * math.cos(theta), rel=1e-14)
     if 1e-3 < theta < math.pi - 1e-3:
         assert motion.phi_dot[0] == pytest.approx(3.0, rel=1e-13)
 
@@ -115,28 +122,42 @@ def test_every_top_can_be_drawn(changed):
     assert math.isfinite(shape.tip)
 
 
-@pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz', 'name'), [
+# theta, theta', L3, Lz/L3, name
+AT_A_POLE = [
     (0.0, 0.0, math.nextafter(2.0, 3.0), 1.0, 'sleeping'),
     (0.0, 0.0, 2.0, 1.0, 'sleeping, unstable'), (0.0, 0.0, -2.0, 1.0, 'sleeping, unstable'),
     (math.pi, 0.0, 2.0, -1.0, 'hanging'), (0.8, -3.5, 0.5, 1.0, 'through the top'),
-    (2.0, 3.5, 0.5, -1.0, 'through the bottom')])
+    (2.0, 3.5, 0.5, -1.0, 'through the bottom'), (0.0, 0.0, 0.0, 0.0, 'at rest')]
+
+
+@pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz', 'name'), AT_A_POLE)
 def test_a_motion_at_or_through_a_pole_has_its_name(theta, theta_dot, l3, lz, name):
-    """It sleeps where L3^2 > 4 lambda1 |P|; with lambda1 = P = 1 both sides are exact."""
-    top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=1.0, gravity=1.0)
+    """It sleeps where L3^2 > 4 lambda1 |P|; with these constants both sides are exact."""
+    top = Top(lambda1=0.5, lambda3=0.5, mass=1.0, com_distance=1.0, gravity=2.0)
     described = ExactSolution(
         top, State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz * l3)).describe()
     assert described.name == name and described.gyroscopic_ratio == 0.25 * l3 * l3
+    assert (described.nutation_period is None) == (theta_dot == 0.0)
 
 
-@pytest.mark.parametrize(('theta', 'name'), [(0.0, 'hanging'), (math.pi, 'sleeping')])
-def test_a_centre_of_mass_below_the_pivot_hangs_where_the_axis_is_up(theta, name):
-    top = Top(**{**TOP, 'com_distance': -0.15})
-    state = State(theta=theta, l3=3.0, lz=3.0 * math.cos(theta))
-    assert ExactSolution(top, state).describe().name == name
+# Distance, theta, L3, Lz, name
+NOT_ABOVE = [
+    (-0.15, 0.0, 3.0, 3.0, 'hanging'), (-0.15, math.pi, 3.0, -3.0, 'sleeping'),
+    (-0.15, 1.0, 0.0, 0.0, 'planar pendulum, swinging'), (-0.15, 2.2, 0.6, -0.6, 'waves'),
+    (0.0, 0.7, 0.0, 0.0, 'at rest')]
+
+
+@pytest.mark.parametrize(('distance', 'theta', 'l3', 'lz', 'name'), NOT_ABOVE)
+def test_a_centre_of_mass_that_is_not_above_the_pivot(distance, theta, l3, lz, name):
+    top, state = Top(**{**TOP, 'com_distance': distance}), State(theta=theta, l3=l3, lz=lz)
+    described = ExactSolution(top, state).describe()
+    assert described.name == name
+    assert described.theta_min - 1e-15 <= theta <= described.theta_max + 1e-15
 
 
 @pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz', 'name'), [
-    (0.6, 0.0, 1.6, 1.0, 'loops'), (1.2, 0.5, 0.3, 0.5, 'waves'), (1.2, 0.5, -0.3, 0.5, 'waves'),
+    (0.6, 0.0, 1.6, 1.0, 'loops'), (2.0, 0.0, 1.0, -math.cos(2.0), 'loops'),
+    (1.2, 0.5, 0.3, 0.5, 'waves'), (1.2, 0.5, -0.3, 0.5, 'waves'),
     (1.0, 2.0, -0.3, -0.6, 'waves'), (2.0, 1.0, 0.3, -0.5, 'waves'),
     (0.9, 0.0, 1.6, 1.6, 'through the top'), (1.0, 0.0, 0.0, 0.0, 'planar pendulum, swinging')])
 def test_the_extremes_are_those_of_the_motion(theta, theta_dot, l3, lz, name):

@@ -6,7 +6,6 @@ The readers are rosbags and mcap, none of them written here.  What a slow, full 
 does: test_world.py and test_failing_calls.py.
 """
 
-import errno
 import json
 import os
 import random
@@ -35,7 +34,6 @@ from spinning_top_sim.recording.errors import MAX_BYTES
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder, single
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, qos_profiles
-from spinning_top_sim.recording.writer import McapWriter
 
 
 def record(path, messages, topics=TOPICS, metadata=METADATA.copy, **options):
@@ -189,23 +187,6 @@ def test_too_little_space_leaves_no_file_and_holds_nobody_up(tmp_path, monkeypat
                         recorder.error)
     assert (recorder.path, recorder.missing, recorder.written) == (None, 1, (0, 0))
     assert recorder.room and not list(tmp_path.iterdir())
-
-
-def test_what_a_full_disk_took_of_a_chunk_is_cut_off_behind_the_summary(tmp_path, monkeypatch):
-    def full(descriptor, data, offset):
-        if len(data) < 1_000_000:
-            raise OSError(errno.ENOSPC, 'No space left on device')
-        return write(descriptor, data[:len(data) // 2], offset)
-
-    write, path = os.pwrite, tmp_path / 'run.mcap'
-    file = McapWriter(path, TOPICS, METADATA, compression='none')
-    file.add(*single(0, 1, bytes(1_000_000)))       # longer than the summary
-    with monkeypatch.context() as patch, pytest.raises(OSError, match='No space'):
-        patch.setattr(os, 'pwrite', full)
-        file.flush()
-    file.finish()
-    with LogReader(path) as reader:
-        assert reader.whole
 
 
 def test_a_failure_ends_the_wait_for_room(tmp_path, monkeypatch):

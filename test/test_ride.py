@@ -109,7 +109,8 @@ def ride(acceleration):
     State(theta=math.pi, phi=1.0, psi=2.0, l3=0.5, lz=-0.5),
     State(theta=1e-9, theta_dot=0.2, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
     State(theta=1e-6, l3=0.0, lz=5e-26), State(theta=0.0, theta_dot=1e-50, l3=0.5, lz=0.5),
-    State(theta=1e-20, l3=0.0, lz=1e-50), State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5),
+    State(theta=1e-20, l3=0.0, lz=1e-50), Posture(5e-21 + 0j, 1 + 0j, 0.7 + 0.1j, 0.0),
+    State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5),
     State(theta=3.0, theta_dot=9.0, l3=0.5, lz=-0.5), State(theta=0.8, theta_dot=-9.0, l3=0, lz=0),
     State(theta=0.0018, theta_dot=0.008803139254, l3=0.0, lz=0.0)])     # next to the separatrix
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
@@ -197,9 +198,20 @@ def test_a_repeated_path_closes(waypoints):
 
 def test_a_repeated_path_that_does_not_close_goes_on():
     """With a velocity that is the same after a cycle, but for rounding."""
-    path = PivotPath([(S, (1.0, 0.0, 0.3)), (3 * S, (-1.0 / 3.0, 0.0, -0.1))], repeat=True)
+    path = PivotPath([(S, (1.0, 0.0, 0.3)), (3 * S, (-1.0 / 3.0, 0.0, -0.1))],
+                     repeat=True, velocity=(0.0, 0.5, 0.0))
     found = kinematics(path, [S, 4 * S - 1, 4 * S, 4 * S * 10 ** 6 + S])
     # 0.5 m in the first second, and 1 s + 3 s at a mean of 0.5 m/s in a cycle.
     assert found.position[:, 0] == pytest.approx([0.5, 2.0, 2.0, 2e6 + 0.5], rel=1e-15)
     assert found.velocity[:, 0] == pytest.approx([1.0, 1e-9 / 3.0, 0.0, 1.0], abs=1e-15)
     assert found.acceleration[:, 2].tolist() == [-0.1, -0.1, 0.3, -0.1]
+
+
+def test_a_path_that_is_not_repeated_ends_at_its_last_waypoint():
+    """The first leg has ramps of 0.75 s and a cruise of 1.25 s, the other two ramps of 0.5 s."""
+    path = PivotPath.through([(1, 0, 0), (4, 0, 0), (4, 0.5, 0)], speed=1.5, acceleration=2.0)
+    found = kinematics(path, [0, 3 * S // 4, 2 * S, 11 * S // 4, 13 * S // 4, 15 * S // 4, 9 * S])
+    assert found.position.sum(1).tolist() == [1.0, 1.5625, 3.4375, 4.0, 4.25, 4.5, 4.5]
+    assert found.velocity.sum(1).tolist() == [0.0, 1.5, 1.5, 0.0, 1.0, 0.0, 0.0]
+    with pytest.raises(ValueError, match='t = -1 ns: must not be before the start of'):
+        path.ride(-1)
