@@ -133,8 +133,8 @@ stress: dependencies
 	.ci/stress '$(VENV)' $(TIMES)
 
 #: make mutation
-#:              change the source in one place at a time, and list what no test
-#:              notices
+#:              change the core in one place at a time, and list what no test
+#:              notices, hours; MUTANTS='*.pivot.*' changes this alone
 mutation: $(VENV)/.deps-mutation dependencies
 	$(BIN)/mutmut' run --max-children $(WORKERS) $(MUTANTS)
 	$(BIN)/mutmut' results
