@@ -232,7 +232,7 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
         recorder = record(uri, [])
         assert re.fullmatch(f'{tmp_path}/{path}', str(recorder.path))
         with LogReader(recorder.path) as reader:
-            assert reader.whole
+            assert reader.whole and reader.span == (0, 0)
     content = (tmp_path / 'run.mcap').read_bytes()
     for uri, reason in (('run.mcap', 'File exists'), ('none/a.mcap', 'No such file or directory')):
         assert record(uri, []).error == f'cannot write {tmp_path}/{uri}: {reason}'

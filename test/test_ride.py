@@ -174,8 +174,6 @@ def test_joined_states_have_the_columns_of_their_parts():
             [rows(part, name) for part in parts], axis=-1)), name
 
 
-# The path of the pivot
-
 TRIANGLE = [(0.1, 0.2, 0.3), (1.7, 0.3, -0.4), (0.6, 2.1, 0.9)]
 
 

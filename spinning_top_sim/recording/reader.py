@@ -109,7 +109,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.torn, self.lost_bytes, self.changed = False, 0, False
+        self.lost_bytes, self.changed = 0, False
         # Of messages; of metadata and attachments.
         self._places, self._attached = list[Place](), list[Place]()
         try:

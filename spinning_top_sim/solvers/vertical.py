@@ -144,7 +144,7 @@ class Vertical(NamedTuple):
         x, y, z = map(real, acceleration)
         z += real(top.gravity)
         size = (x * x + y * y + z * z) ** 0.5 * (-1 if z < 0 else 1)
-        x, y, z = (x / size, y / size, z / size) if size else (0 * x, 0 * y, 1 + 0 * z)
+        x, y, z = (x / size, y / size, z / size) if size else (x, y, 1 + z)
         cosine = ((1 + z) / 2) ** 0.5
         return cls(size, replace(top, gravity=float(size)), cosine + 0j,
                    (x + 1j * y) / (2 * cosine))
