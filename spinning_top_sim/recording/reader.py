@@ -194,10 +194,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                         if one.channel_id in wanted and start <= one.log_time < end]
             waiting.sort()
 
-    def groups(self, topics: Collection[str] | None = None, start: int = 0, end: int = 1 << 64,
-               ) -> Iterator[tuple[str, list[LogMessage]]]:
+    def groups(self) -> Iterator[tuple[str, list[LogMessage]]]:
         """Yield topics and messages of each, some at a time, in the order of `messages`."""
-        messages = self.messages(topics, start, end)
+        messages = self.messages()
         while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
