@@ -34,7 +34,7 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.recording.writer import record_bytes
 
 ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
@@ -119,7 +119,6 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
     if torn:        # within the indexes of the last chunk
         os.truncate(path, max(end for opcode, _, end in records_of(path.read_bytes())
                               if opcode == Opcode.MESSAGE_INDEX) - 1)
-    wanted = sorted(rows, key=lambda row: row[1])
     stamps = [row[1] for row in rows]
     last = max(stamps[:50])     # of the first chunk
     with LogReader(path) as reader:
@@ -131,9 +130,10 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
                 ({'start': last, 'end': last + 1}, lambda topic, stamp, data: stamp == last),
                 ({'topics': []}, lambda *_: False)):
             assert [(message.log_time, message.data) for message in reader.messages(**given)] == [
-                row[1:] for row in wanted if chosen(*row)]
-        assert all(message.sequence == struct.unpack('<I', message.data)[0] // 2
-                   for message in reader.messages())
+                row[1:] for row in sorted(rows, key=lambda row: row[1]) if chosen(*row)]
+        found = [one for one in reader.recorded() if isinstance(one, LogMessage)]
+        assert [one.data for one in found] == [row[2] for row in rows]
+        assert [one.sequence for one in found] == [number // 2 for number in range(600)]
 
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))
@@ -226,10 +226,11 @@ FIRST, SECOND = message(5, b'first'), message(5, b'second' * 50)
 
 @pytest.mark.parametrize('bad', [
     chunk_of(FIRST, 'zstd', zstandard.compress(FIRST + SECOND), uncompressed_crc=0),   # too much
-    chunk_of(bytes(9 << 16), 'lz4', lz4.frame.compress(bytes(9 << 16))),
-    chunk_of(FIRST, uncompressed_crc=7), chunk_of(FIRST, 'zstd', b'noise'),
-    chunk_of(message(5, b'', channel=7)), chunk_of(FIRST, 'brotli'), chunk_of(FIRST[:-1]),
-    chunk_of(message(5, bytes(5000))), record_bytes(MetadataRecord('big', {'k': 'v' * 5000}))])
+    chunk_of(bytes(9 << 16), 'lz4', lz4.frame.compress(bytes(9 << 16))), chunk_of(FIRST, 'brotli'),
+    chunk_of(FIRST, 'lz4', b'\x04"M\x18' + bytes(30)), chunk_of(message(5, b'', channel=7)),
+    chunk_of(FIRST, 'lz4', lz4.frame.compress(FIRST)[:-9]), chunk_of(FIRST, uncompressed_crc=7),
+    chunk_of(FIRST, 'zstd', b'noise'), chunk_of(FIRST[:-1]), chunk_of(message(5, bytes(5000))),
+    record_bytes(MetadataRecord('big', {'k': 'v' * 5000}))])
 def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
     path = closed(tmp_path, bad, chunk_of(message(4, b'a')), bad, chunk_of(message(6, b'c')))
     with LogReader(path, max_bytes=4000) as reader:
