@@ -28,31 +28,32 @@ STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz
         ('lz', '1.0 kg'))),
     *((State.from_rates, {'theta': 0.5, 'top': Top(**TOP), 'precession': 1.0, 'spin': 2.0},
        field, value) for field, value in (
-           ('theta', math.nan), ('precession', math.nan), ('spin', '3 rad/s')))])
+           ('theta', -0.1), ('theta', math.nan), ('precession', math.nan), ('spin', '3 rad/s')))])
 def test_a_bad_constant_state_or_rate_is_refused_by_name_and_value(make, given, field, value):
     with pytest.raises(ValueError, match=rf'{field} = .*must ') as error:
         make(**{**given, field: value})
     assert repr(value) in str(error.value)
 
 
-@pytest.mark.parametrize(('theta', 'pole'), [(0.0, 'l3 = 1.6'), (math.pi, '-l3 = -1.6')])
-def test_at_a_pole_only_one_momentum_is_possible(theta, pole):
-    with pytest.raises(ValueError, match=rf'^lz = 0\.3 kg .* {theta} rad\) it must equal {pole}$'):
-        State(**{**STATE, 'theta': theta, 'lz': 0.3})
+@pytest.mark.parametrize(('theta', 'lz', 'pole'), [
+    (0.0, -1.6, 'l3 = 1.6'), (math.pi, 1.6, '-l3 = -1.6')])
+def test_at_a_pole_only_one_momentum_is_possible(theta, lz, pole):
+    with pytest.raises(ValueError, match=rf'^lz = {lz} kg .* {theta} rad\) it must equal {pole}$'):
+        State(**{**STATE, 'theta': theta, 'lz': lz})
 
 
 @pytest.mark.parametrize('theta', [0.0, 1e-9, 0.7, 3.0, math.pi])
 def test_a_state_from_rates_turns_at_them(theta):
     top, turning = Top(**TOP), State.from_rates
-    assert turning(theta, 3.0, top=top) == turning(
-        theta, 3.0, 0.0, 0.0, top=top, phi=0.0, psi=0.0)
-    state = turning(theta, 3.0, -0.4, 3.0, top=top, phi=0.2, psi=-1.0)
+    assert turning(theta, 3.0, top=top) == turning(theta, 3.0, 0.0, 0.0, top=top, phi=0, psi=0)
+    assert turning(math.pi, 3.0, spin=3.0, top=top).lz == 0.0       # sin(pi) is not 0 in doubles
+    state = turning(theta, 3.0, -0.4, 12.0, top=top, phi=0.2, psi=-1.0)
     motion = solve(top, state, [0.0])
     assert (state.theta, state.phi, state.psi) == (theta, 0.2, -1.0)
     assert motion.theta_dot[0] == pytest.approx(-0.4, rel=1e-14)
     # At a pole only the sum or the difference of the two has a meaning.
     turned = motion.psi_dot[0] + motion.phi_dot[0] * math.cos(theta)
-    assert turned == pytest.approx(3.0 + 3.0 * math.cos(theta), rel=1e-14)
+    assert turned == pytest.approx(12.0 + 3.0 * math.cos(theta), rel=1e-14)
     if 1e-3 < theta < math.pi - 1e-3:
         assert motion.phi_dot[0] == pytest.approx(3.0, rel=1e-13)
 
@@ -122,7 +123,6 @@ def test_every_top_can_be_drawn(changed):
     assert math.isfinite(shape.tip)
 
 
-# theta, theta', L3, Lz/L3, name
 AT_A_POLE = [
     (0.0, 0.0, math.nextafter(2.0, 3.0), 1.0, 'sleeping'),
     (0.0, 0.0, 2.0, 1.0, 'sleeping, unstable'), (0.0, 0.0, -2.0, 1.0, 'sleeping, unstable'),
@@ -140,7 +140,6 @@ def test_a_motion_at_or_through_a_pole_has_its_name(theta, theta_dot, l3, lz, na
     assert (described.nutation_period is None) == (theta_dot == 0.0)
 
 
-# Distance, theta, L3, Lz, name
 NOT_ABOVE = [
     (-0.15, 0.0, 3.0, 3.0, 'hanging'), (-0.15, math.pi, 3.0, -3.0, 'sleeping'),
     (-0.15, 1.0, 0.0, 0.0, 'planar pendulum, swinging'), (-0.15, 2.2, 0.6, -0.6, 'waves'),
